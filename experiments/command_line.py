@@ -1,0 +1,122 @@
+"""What every experiment's command line shares: ``--config``, overrides, errors without traceback."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import os
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from absl import app, flags
+from ml_collections import config_flags
+
+from experiments.experiment import Experiment
+from vanejax.errors import InputError
+
+CONFIG_FOLDER = Path(__file__).parent / "configs"
+_OVERRIDE = re.compile(r"--?config\.([^=]+)")
+
+
+def define_config() -> flags.FlagHolder:
+    """Defines ``--config``; its value is an `Experiment` once flags are parsed."""
+    names = ", ".join(sorted(path.name for path in CONFIG_FOLDER.glob("[!_]*.py")))
+    return config_flags.DEFINE_config_file(
+        "config",
+        None,
+        f"a file with get_config(), here or in experiments/configs/ ({names}). Any field can be "
+        "overridden: --config.model.num_neighbors=16",
+    )
+
+
+def define_workdir() -> flags.FlagHolder:
+    """Defines ``--workdir``; see `workdir` for its default."""
+    return flags.DEFINE_string(
+        "workdir", None, "folder of the run; runs/NAME with the config's name if not given"
+    )
+
+
+def workdir(given: flags.FlagHolder, config: flags.FlagHolder) -> Path:
+    """The folder of the run."""
+    return Path(given.value or f"runs/{config.value.name}")
+
+
+def run(main: Callable[[], int | None]) -> None:
+    """Parses the command line, runs ``main`` and exits: 0, or 2 where the input is at fault."""
+    # jaxlib announces things about TPUs and GPUs that are not there
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+
+    def guarded(rest: list[str]) -> int:
+        try:
+            if len(rest) > 1:
+                raise InputError(f"no such argument: {' '.join(rest[1:])}; see --help")
+            if flags.FLAGS.config is None:
+                raise InputError("--config is missing; try --config vane.py, or --help")
+            return main() or 0
+        except InputError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
+
+    try:
+        argv = resolve_config(sys.argv)
+        app.run(guarded, argv=argv, flags_parser=_parse)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def resolve_config(argv: list[str]) -> list[str]:
+    """Replaces a bare config name by its path: the working folder first, then ours.
+
+    Raises:
+      InputError: no such file; names the ones there are.
+    """
+    argv = list(argv)
+    for index, argument in enumerate(argv):
+        name, equals, value = argument.partition("=")
+        if name not in ("--config", "-config"):
+            continue
+        if not equals:
+            if index + 1 == len(argv):
+                raise InputError("--config needs a file, such as --config vane.py")
+            value = argv[index + 1]
+        found = next((p for p in (Path(value), CONFIG_FOLDER / value) if p.is_file()), None)
+        if found is None:
+            there = ", ".join(sorted(p.name for p in CONFIG_FOLDER.glob("[!_]*.py")))
+            raise InputError(f"no config {value!r} here or in experiments/configs/: {there}")
+        if equals:
+            argv[index] = f"{name}={found}"
+        else:
+            argv[index + 1] = str(found)
+    return argv
+
+
+def _parse(argv: list[str]) -> list[str]:
+    """absl's parser, with overrides checked first so that a typo lists the right names."""
+    overrides = [m.group(1) for a in argv[1:] if (m := _OVERRIDE.match(a))]
+    for path in overrides:
+        _check_field(path)
+    try:
+        return app.parse_flags_with_usage(argv)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"a config override is wrong: {error}") from error
+
+
+def _check_field(path: str) -> None:
+    node: Any = Experiment()
+    walked = "config"
+    for name in path.split("."):
+        names = [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
+        if name not in names:
+            near = difflib.get_close_matches(name, names, 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            right = f"its fields are: {', '.join(names)}" if names else "it has no fields"
+            raise InputError(f"--config.{path}: {walked} has no {name!r}{hint} ({right})")
+        node = getattr(node, name)
+        walked = f"{walked}.{name}"
+    if dataclasses.is_dataclass(node):
+        names = ", ".join(f.name for f in dataclasses.fields(node))
+        raise InputError(f"--config.{path} is a group; set one of its fields: {names}")

@@ -1,0 +1,12 @@
+"""The default recipe: the paper's data and network, with what was measured to train better."""
+
+from experiments.experiment import Experiment, LossSettings, TrainingSettings
+
+
+def get_config() -> Experiment:
+    """About an hour on two cores."""
+    return Experiment(
+        name="vane",
+        loss=LossSettings(matching=0.02),
+        training=TrainingSettings(),
+    )

@@ -1,0 +1,249 @@
+"""What an experiment is: a typed tree of settings, and how it becomes objects of vanejax.
+
+Every field can be overridden on the command line: ``--config.model.num_neighbors=16``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import field
+
+import numpy as np
+import optax
+
+from vanejax.camera import Camera, Viewpoints, hemisphere_viewpoints
+from vanejax.dataset import ScanSet
+from vanejax.errors import InputError
+from vanejax.models.rpmnet import RpmNet
+from vanejax.pairs import Drawing, source_sizes
+from vanejax.part import Part, load_part
+from vanejax.training import RpmNetLoss, make_optimizer
+from vanejax.vane import guide_vane
+
+
+@dataclasses.dataclass
+class PartSettings:
+    """The workpiece.
+
+    Attributes:
+      path: a CAD file; empty for the parametric guide vane.
+      units: of the file: mm, cm, m, in.
+    """
+
+    path: str = ""
+    units: str = "mm"
+
+
+@dataclasses.dataclass
+class ViewSettings:
+    """The camera and where it stands (paper, Table 2 and Algorithm 1).
+
+    Attributes:
+      distance_mm: from the part's centre.
+      formula: "sphere", or "printed" for the paper's literal formula.
+      elevations_deg, azimuths_deg: angles of the viewpoints, every pair of them.
+      resolution: share of the camera's 1280 x 1024 pixels per side; below 1 only for quick runs.
+    """
+
+    distance_mm: float = 400.0
+    formula: str = "sphere"
+    elevations_deg: tuple[float, ...] = (60.0, 65.0, 70.0, 75.0, 80.0, 85.0)
+    azimuths_deg: tuple[float, ...] = tuple(float(angle) for angle in range(0, 360, 10))
+    resolution: float = 1.0
+
+
+@dataclasses.dataclass
+class DataSettings:
+    """How pairs are drawn from the scans (paper, section III.D).
+
+    Attributes:
+      voxel_mm: thinning of scans and CAD surface before points are drawn.
+      num_reference: M; sources have M X / Y points.
+      noise: standard deviation on both clouds, unit-sphere units.
+      noise_clip: largest noise per coordinate, unit-sphere units.
+      max_rotation_deg: largest angle of the random pose.
+      max_translation: largest coordinate of its translation, unit-sphere units.
+    """
+
+    voxel_mm: float = 1.5
+    num_reference: int = 1024
+    noise: float = 0.01
+    noise_clip: float = 0.05
+    max_rotation_deg: float = 45.0
+    max_translation: float = 0.5
+
+
+@dataclasses.dataclass
+class ModelSettings:
+    """RPM-Net.
+
+    Attributes:
+      num_neighbors: the paper's k.
+      radius: of a neighbourhood, unit-sphere units.
+      sinkhorn_iterations: rounds of normalisation.
+      feature_width: channels of a feature.
+      test_iterations: of the network at inference.
+    """
+
+    num_neighbors: int = 32
+    radius: float = 0.3
+    sinkhorn_iterations: int = 5
+    feature_width: int = 96
+    test_iterations: int = 5
+
+
+@dataclasses.dataclass
+class LossSettings:
+    """Factors of the parts of the loss; see `vanejax.training.RpmNetLoss`."""
+
+    iterations: int = 2
+    discount: float = 0.5
+    pose: float = 1.0
+    inlier: float = 0.01
+    matching: float = 0.0
+    matching_sigma: float = 0.04
+    partner: float = 0.0
+    pairs_at_once: int = 1
+
+
+@dataclasses.dataclass
+class TrainingSettings:
+    """The optimizer and the length of the run.
+
+    Attributes:
+      steps: of the optimizer.
+      batch_size: views per step; they share one reference.
+      learning_rate: peak of Adam's.
+      warmup_steps: linear growth from 0 to the peak.
+      final_fraction: of the peak, at the end of the cosine decay.
+      clip_norm: largest global norm of a gradient.
+      average_decay: of the moving average of the weights, which is what is evaluated; 0 for none.
+      log_every, evaluate_every, save_every: in steps.
+      keep: checkpoints kept besides the best.
+      validation_pairs: drawn from the training views with a key of their own; they choose the
+        best checkpoint, so that the test views stay unseen.
+    """
+
+    steps: int = 5000
+    batch_size: int = 4
+    learning_rate: float = 1e-3
+    warmup_steps: int = 100
+    final_fraction: float = 0.0
+    clip_norm: float = 1.0
+    average_decay: float = 0.995
+    log_every: int = 10
+    evaluate_every: int = 250
+    save_every: int = 250
+    keep: int = 2
+    validation_pairs: int = 18
+
+
+@dataclasses.dataclass
+class Experiment:
+    """One experiment; a config file's ``get_config()`` returns it.
+
+    Attributes:
+      name: of the run: the default work folder is ``runs/NAME``.
+      seed: of everything random.
+    """
+
+    name: str = "vane"
+    seed: int = 0
+    part: PartSettings = field(default_factory=PartSettings)
+    views: ViewSettings = field(default_factory=ViewSettings)
+    data: DataSettings = field(default_factory=DataSettings)
+    model: ModelSettings = field(default_factory=ModelSettings)
+    loss: LossSettings = field(default_factory=LossSettings)
+    training: TrainingSettings = field(default_factory=TrainingSettings)
+
+    def make_camera(self) -> Camera:
+        """The paper's camera at the wanted resolution."""
+        return Camera().scaled(self.views.resolution)
+
+    def make_part(self) -> Part:
+        """The CAD file, or the guide vane if none is named."""
+        if not self.part.path:
+            return guide_vane()
+        return load_part(self.part.path, units=self.part.units, camera=self.make_camera())
+
+    def make_viewpoints(self, part: Part) -> Viewpoints:
+        """Algorithm 1 around the part's centre."""
+        return hemisphere_viewpoints(
+            part.center,
+            distance_mm=self.views.distance_mm,
+            elevations_deg=self.views.elevations_deg,
+            azimuths_deg=self.views.azimuths_deg,
+            formula=self.views.formula,
+        )
+
+    def make_drawing(self, scans: ScanSet) -> Drawing:
+        """How pairs are drawn; the rows of a source fit the view that sees most."""
+        return Drawing(
+            num_reference=self.data.num_reference,
+            num_source=int(source_sizes(scans, self.data.num_reference).max()),
+            noise=self.data.noise,
+            noise_clip=self.data.noise_clip,
+            max_rotation_deg=self.data.max_rotation_deg,
+            max_translation=self.data.max_translation,
+        )
+
+    def make_model(self) -> RpmNet:
+        """The network, without parameters."""
+        return RpmNet(
+            num_neighbors=self.model.num_neighbors,
+            radius=self.model.radius,
+            sinkhorn_iterations=self.model.sinkhorn_iterations,
+            feature_width=self.model.feature_width,
+        )
+
+    def make_loss(self) -> RpmNetLoss:
+        """The loss of training."""
+        return RpmNetLoss(**dataclasses.asdict(self.loss))
+
+    def make_optimizer(self) -> optax.GradientTransformation:
+        """Adam with its schedule."""
+        settings = self.training
+        return make_optimizer(
+            learning_rate=settings.learning_rate,
+            steps=settings.steps,
+            warmup_steps=settings.warmup_steps,
+            clip_norm=settings.clip_norm,
+            final_fraction=settings.final_fraction,
+        )
+
+    def check(self) -> None:
+        """Refuses settings that cannot be run.
+
+        Raises:
+          InputError: names the field, its value and what it must be.
+        """
+        positive = {
+            "training": ("steps", "batch_size", "learning_rate", "clip_norm", "log_every"),
+            "data": ("voxel_mm", "num_reference", "noise_clip"),
+            "model": ("num_neighbors", "radius", "sinkhorn_iterations", "test_iterations"),
+            "loss": ("iterations", "matching_sigma", "pairs_at_once"),
+            "views": ("distance_mm", "resolution"),
+        }
+        positive["training"] += ("evaluate_every", "save_every", "keep", "validation_pairs")
+        not_negative = {
+            "data": ("noise", "max_rotation_deg", "max_translation"),
+            "loss": ("discount", "pose", "inlier", "matching", "partner"),
+            "training": ("warmup_steps", "final_fraction"),
+        }
+        for groups, least, words in ((positive, False, "positive"), (not_negative, True, ">= 0")):
+            for group, names in groups.items():
+                for name in names:
+                    value = getattr(getattr(self, group), name)
+                    if not (np.isfinite(value) and (value >= 0 if least else value > 0)):
+                        raise InputError(f"config.{group}.{name}={value!r} must be {words}")
+        if self.model.feature_width % 8:
+            raise InputError(
+                f"config.model.feature_width={self.model.feature_width} must be a multiple of 8, "
+                "the number of groups of the normalisation"
+            )
+        if not 0 <= self.training.average_decay < 1:
+            raise InputError(
+                f"config.training.average_decay={self.training.average_decay} must lie in [0, 1)"
+            )
+        if not any((self.loss.pose, self.loss.matching, self.loss.partner)):
+            raise InputError("config.loss: pose, matching and partner are all 0: nothing to learn")

@@ -1,0 +1,170 @@
+"""The folder of one training run: its config, what it ran on, its log and its lock."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import fcntl
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from experiments.experiment import Experiment
+from vanejax.errors import InputError
+from vanejax.part import Part
+
+PACKAGES = ("vanejax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "embreex")
+
+
+class RunFolder:
+    """Owns a work folder while a run lasts; use as a context manager.
+
+    Raises:
+      InputError: the folder cannot be written, or another process is training in it.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self._events: Any = None
+
+    def __enter__(self) -> RunFolder:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = open(self.path / ".lock", "w")  # noqa: SIM115 (held until exit)
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"{self.path}: another process is training there; choose another --workdir"
+            ) from None
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: cannot be used as a work folder ({error.strerror}); "
+                "choose another --workdir"
+            ) from error
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._events is not None:
+            self._events.close()
+        self._lock.close()
+
+    @property
+    def checkpoints(self) -> Path:
+        """Where the checkpoints are."""
+        return self.path / "checkpoints"
+
+    @property
+    def metrics(self) -> Path:
+        """The JSONL log."""
+        return self.path / "metrics.jsonl"
+
+    def claim(self, config: Experiment, part: Part) -> None:
+        """Records what runs here, or checks that it is the same as what ran here before.
+
+        Raises:
+          InputError: the folder holds a run of another config or part; names what differs.
+        """
+        settings = json.loads(json.dumps(dataclasses.asdict(config)))
+        mine = {"config": settings, "part": {"name": part.name, "sha256": part.sha256}}
+        record = self.path / "run.json"
+        if record.exists():
+            theirs = read_json(record)
+            differences = list(_differences(theirs, mine))
+            if differences:
+                raise InputError(
+                    f"{self.path} holds a run of another experiment: {'; '.join(differences)}. "
+                    "Choose another --workdir, or give the config that it was started with."
+                )
+            return
+        environment = {
+            "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+            "python": platform.python_version(),
+            "commit": git_commit(),
+            "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        }
+        write_json(record, mine | environment)
+
+    def open_log(self, step: int) -> None:
+        """Readies the log for the rows after ``step``: what a killed run wrote beyond it goes."""
+        from tensorboardX import SummaryWriter  # takes a second to import
+
+        rows = [row for row in read_log(self.path) if row["step"] <= step]
+        text = "".join(json.dumps(row) + "\n" for row in rows)
+        write_text(self.metrics, text)
+        self._events = SummaryWriter(str(self.path / "events"), purge_step=step + 1)
+
+    def log(self, step: int, values: dict[str, float]) -> None:
+        """Appends a row to the JSONL log and to the TensorBoard events."""
+        with open(self.metrics, "a") as file:
+            file.write(json.dumps({"step": step} | values) + "\n")
+        for name, value in values.items():
+            self._events.add_scalar(name, value, step)
+
+
+def read_log(folder: str | os.PathLike[str]) -> list[dict[str, float]]:
+    """The rows of a run's JSONL log; a last line cut off by a kill is left out."""
+    path = Path(folder) / "metrics.jsonl"
+    rows = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(row, dict) and isinstance(row.get("step"), int):
+            rows.append(row)
+    return rows
+
+
+def read_json(path: Path) -> Any:
+    """A JSON file.
+
+    Raises:
+      InputError: it cannot be read.
+    """
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes JSON; the file appears complete or not at all."""
+    write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file; it appears complete or not at all."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(text)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def git_commit() -> str | None:
+    """The commit of the source tree, with "+" where it has changes; None outside of git."""
+    here = Path(__file__).parent
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(here), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _differences(old: Any, new: Any, path: str = "") -> Iterator[str]:
+    """Which fields of ``new`` differ from ``old``, as readable sentences."""
+    if isinstance(new, dict) and isinstance(old, dict):
+        for key in new:
+            yield from _differences(old.get(key), new[key], f"{path}.{key}" if path else key)
+    elif old != new:
+        yield f"{path} was {old!r}, now {new!r}"

@@ -1,0 +1,249 @@
+"""Trains a registration network on virtual scans of a part, then evaluates it.
+
+python -m experiments.train --config vane.py [--workdir runs/vane] [--config.FIELD=VALUE ...]
+
+Makes the part, scans it from every viewpoint, trains, and registers the test views. Kill it and
+start it again: it goes on where its last checkpoint stands and ends bit-equal.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from experiments import command_line
+from experiments.evaluate import evaluate
+from experiments.experiment import Experiment
+from experiments.run_folder import RunFolder
+from vanejax.checkpoint import Checkpoints, all_finite, restore_or
+from vanejax.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
+from vanejax.pairs import Drawing, ScanBank, draw_pairs, make_bank
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+from vanejax.training import (
+    Metrics,
+    TrainState,
+    Variables,
+    init_state,
+    make_train_step,
+    pose_errors,
+)
+
+DIVERGED = 20.0  # times the loss of the first rows: no run of use comes back from there
+
+
+class TrainingDiverged(RuntimeError):
+    """The loss is not finite or has exploded; the last good checkpoint stands."""
+
+
+class Interrupted(RuntimeError):
+    """SIGINT or SIGTERM; the state is saved.
+
+    Attributes:
+      signal: its number.
+    """
+
+    def __init__(self, number: int, step: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name} after step {step}")
+        self.signal = number
+
+
+def train(config: Experiment, workdir: Path) -> TrainState:
+    """Trains to the end, resuming what ``workdir`` holds, and evaluates on the test views.
+
+    Raises:
+      InputError: settings, part or folder that cannot be used.
+      TrainingDiverged: NaN or an exploding loss.
+      Interrupted: SIGINT or SIGTERM, after the state was saved.
+    """
+    config.check()
+    with RunFolder(workdir) as folder:
+        part = config.make_part()
+        folder.claim(config, part)
+        scans = load_or_scan(config, part, folder.path / "scans.npz")
+        state = fit(config, scans, folder)
+    return state
+
+
+def load_or_scan(config: Experiment, part: Part, path: Path) -> ScanSet:
+    """The scans of the part: from the file if there is one, else scanned and saved there."""
+    camera, viewpoints = config.make_camera(), config.make_viewpoints(part)
+    voxel_mm = config.data.voxel_mm
+    if path.exists():
+        expected = describe_source(part, camera, viewpoints, voxel_mm)
+        return load_scan_set(path, expected=expected)
+    scans = make_scan_set(part, camera, viewpoints, voxel_mm=voxel_mm)
+    scans.save(path)
+    return scans
+
+
+def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
+    """Trains on the training views of ``scans``; the test views are not looked at."""
+    settings = config.training
+    model, optimizer, drawing = config.make_model(), config.make_optimizer(), config.make_drawing(scans)
+    bank = make_bank(scans.train, num_reference=config.data.num_reference)
+    step = make_train_step(
+        model,
+        optimizer,
+        config.make_loss(),
+        drawing,
+        batch_size=settings.batch_size,
+        seed=config.seed,
+        average_decay=settings.average_decay,
+    )
+    state = init_state(model, optimizer, bank, drawing, seed=config.seed)
+    state = restore_or(folder.checkpoints, state, keep=settings.keep)
+    validate = make_validation(config, bank, drawing, scans.radius_mm)
+    folder.open_log(int(state.step))
+    recent: list[Metrics] = []
+    monitor = Monitor()
+
+    with Checkpoints(folder.checkpoints, keep=settings.keep) as checkpoints, stop_signal() as stop:
+        bar = tqdm(total=settings.steps, initial=int(state.step), unit="step", desc="training")
+        for done in range(int(state.step) + 1, settings.steps + 1):
+            state, metrics = step(state, bank)
+            recent.append(metrics)
+            last = done == settings.steps
+            leave = bool(stop)
+            if done % settings.log_every == 0 or last or leave:
+                values = average(recent, scans.radius_mm)
+                monitor.check(done, values)
+                folder.log(done, values)
+                bar.set_postfix_str(
+                    f"loss {values['loss']:.4f}, {values['rotation_error_deg']:.2f} deg, "
+                    f"{values['translation_error_mm']:.2f} mm"
+                )
+                recent = []
+            bar.update()
+            score = None
+            if done % settings.evaluate_every == 0 or last:
+                values = validate(state)
+                folder.log(done, values)
+                score = values["validation_rotation_error_deg"]
+            if done % settings.save_every == 0 or score is not None or leave:
+                monitor.check_variables(done, state)
+                checkpoints.save(state, score=score)
+            if leave and not last:
+                bar.close()
+                raise Interrupted(stop[0], done)
+        bar.close()
+    return state
+
+
+class Monitor:
+    """Watches the loss for NaN and divergence."""
+
+    def __init__(self) -> None:
+        self._start: float | None = None
+
+    def check(self, step: int, values: dict[str, float]) -> None:
+        """Raises TrainingDiverged where the row's loss is not finite or has exploded."""
+        bad = [name for name, value in values.items() if not np.isfinite(value)]
+        if bad:
+            raise TrainingDiverged(f"{', '.join(bad)} not finite at step {step}")
+        loss = values["loss"]
+        self._start = self._start or loss
+        if loss > DIVERGED * self._start:
+            raise TrainingDiverged(
+                f"the loss at step {step} is {loss:.3g}, {loss / self._start:.0f} times the first"
+            )
+
+    def check_variables(self, step: int, state: TrainState) -> None:
+        """Raises TrainingDiverged where a weight is not finite: such a state is never saved."""
+        if not all_finite((state.variables, state.average)):
+            raise TrainingDiverged(f"weights not finite at step {step}")
+
+
+def make_validation(
+    config: Experiment, bank: ScanBank, drawing: Drawing, radius_mm: float
+) -> Callable[[TrainState], dict[str, float]]:
+    """Pose errors of the averaged weights on training views, drawn with a key of their own.
+
+    They choose the best checkpoint, so that the test views stay unseen until the end.
+    """
+    model, settings = config.make_model(), config.training
+    key = jax.random.fold_in(jax.random.key(config.seed), 0x7A11DA7E)
+    views = jnp.linspace(0, bank.scans.mask.shape[0] - 1, settings.validation_pairs).astype(int)
+
+    @jax.jit
+    def errors(variables: Variables, bank: ScanBank) -> Metrics:
+        pairs = draw_pairs(key, bank, views, drawing)
+        features = model.apply(variables, pairs.target, method="features")
+
+        def one(pair: tuple[PointCloud, RigidTransform]) -> Metrics:
+            source, truth = pair
+            init, iterations = RigidTransform.identity(), config.model.test_iterations
+            matches = model.apply(variables, source, pairs.target, init, iterations, features)
+            return pose_errors(matches[-1].target_from_source, truth)
+
+        return jax.lax.map(one, (pairs.source, pairs.target_from_source))
+
+    def validate(state: TrainState) -> dict[str, float]:
+        found = jax.device_get(errors(state.average, bank))
+        return {
+            "validation_rotation_error_deg": float(np.mean(found["rotation_error_deg"])),
+            "validation_translation_error_mm": float(np.mean(found["translation_error"]))
+            * radius_mm,
+        }
+
+    return validate
+
+
+@contextmanager
+def stop_signal() -> Iterator[list[int]]:
+    """A list that receives SIGINT or SIGTERM; a second one acts as it always does."""
+    caught: list[int] = []
+    before = {}
+
+    def catch(number: int, _: object) -> None:
+        caught.append(number)
+        signal.signal(number, before[number])
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        before[number] = signal.signal(number, catch)
+    try:
+        yield caught
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def average(rows: list[Metrics], radius_mm: float) -> dict[str, float]:
+    """Means of metrics over steps as plain numbers; the translation error in mm."""
+    fetched = jax.device_get(rows)
+    values = {name: float(np.mean([row[name] for row in fetched])) for name in fetched[0]}
+    values["translation_error_mm"] = values.pop("translation_error") * radius_mm
+    return values
+
+
+def main(config: Experiment, workdir: Path) -> int:
+    """Trains, evaluates and reports; the exit code."""
+    try:
+        state = train(config, workdir)
+    except Interrupted as stop:
+        print(f"{stop}; saved in {workdir}. Run the same command to go on.", file=sys.stderr)
+        return 128 + stop.signal
+    except TrainingDiverged as trouble:
+        print(
+            f"error: training stopped: {trouble}. The last good checkpoint is kept in {workdir}. "
+            "Try a lower --config.training.learning_rate with another --workdir.",
+            file=sys.stderr,
+        )
+        return 1
+    scans = load_scan_set(workdir / "scans.npz")
+    evaluate(config, scans, state.average, workdir)
+    return 0
+
+
+if __name__ == "__main__":
+    CONFIG = command_line.define_config()
+    WORKDIR = command_line.define_workdir()
+    command_line.run(lambda: main(CONFIG.value, command_line.workdir(WORKDIR, CONFIG)))

@@ -1,0 +1,67 @@
+"""Command lines: config look-up, overrides and their errors, seen as a user sees them."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from experiments.command_line import resolve_config
+from vanejax.errors import InputError
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "experiments.train", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+
+
+def test_a_bare_name_is_found_here_first_and_then_in_the_package(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    ours = resolve_config(["train", "--config", "vane.py"])[2]
+    assert Path(ours) == ROOT / "experiments" / "configs" / "vane.py"
+    (tmp_path / "vane.py").write_text("")
+    assert resolve_config(["train", "--config=vane.py"])[1] == "--config=vane.py"
+
+
+def test_an_unknown_config_lists_those_there_are() -> None:
+    with pytest.raises(InputError, match=r"paper\.py, smoke\.py, vane\.py"):
+        resolve_config(["train", "--config", "vain.py"])
+    with pytest.raises(InputError, match="--config needs a file"):
+        resolve_config(["train", "--config"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--config", "vain.py"], ["vain.py", "smoke.py"]),
+        ([], ["--config is missing"]),
+        (
+            ["--config", "smoke.py", "--config.model.num_neighbours=16"],
+            ["num_neighbours", "did you mean num_neighbors?", "radius", "feature_width"],
+        ),
+        (["--config", "smoke.py", "--config.model=16"], ["is a group", "num_neighbors"]),
+        (["--config", "smoke.py", "--config.model.num_neighbors=abc"], ["num_neighbors", "abc"]),
+        (["--config", "smoke.py", "--config.data.noise=-1"], ["config.data.noise=-1.0", ">= 0"]),
+        (["--config", "smoke.py", "--config.part.path=none.stl"], ["none.stl"]),
+        (["--config", "smoke.py", "stray"], ["stray"]),
+    ],
+)
+def test_a_wrong_command_line_is_one_clear_error(
+    arguments: list[str], words: list[str], tmp_path
+) -> None:
+    done = run(*arguments, "--workdir", str(tmp_path / "run"))
+    assert done.returncode not in (0, -1)
+    assert "Traceback" not in done.stderr
+    for word in words:
+        assert word in done.stderr
+
+
+def test_help_names_the_config_and_the_workdir() -> None:
+    done = run("--help")
+    text = done.stdout + done.stderr
+    assert "--config" in text
+    assert "smoke.py" in text
+    assert "--workdir" in text
+    assert "Traceback" not in text

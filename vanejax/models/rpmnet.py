@@ -1,0 +1,277 @@
+"""RPM-Net: robust point matching with learned features (Yew and Lee, CVPR 2020).
+
+Each iteration extracts features from the moved source, matches them to the reference's by a
+sinkhorn-normalised soft assignment with slack, and solves a weighted Procrustes problem for the
+total motion. What does not change is computed once: the reference's features, and the source's
+neighbours and point-pair features, which no rigid motion touches.
+
+Coordinates are in unit-sphere units: the part's centre is the origin, its radius is 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vanejax.errors import InputError
+from vanejax.features import point_pair_features
+from vanejax.matching import log_sinkhorn, soft_correspondences
+from vanejax.models.layers import DenseNormRelu, DenseNormReluMax
+from vanejax.pointcloud import PointCloud, ball_query
+from vanejax.registration import Register, Registration
+from vanejax.rigid import RigidTransform, weighted_procrustes
+
+
+@flax.struct.dataclass
+class Neighborhoods:
+    """What the feature network knows of each point's surroundings.
+
+    Attributes:
+      offsets: [N, K, 3] f32, neighbour minus point.
+      ppf: [N, K, 4] f32, point-pair features, rigid-invariant.
+    """
+
+    offsets: jax.Array
+    ppf: jax.Array
+
+
+@flax.struct.dataclass
+class Match:
+    """One iteration of RPM-Net.
+
+    Attributes:
+      target_from_source: the total motion after this iteration.
+      log_assignment: [N, M] f32.
+      partners: [N, 3] f32, the soft correspondence of each source point.
+      weights: [N] f32, row sums of the assignment; 0 at padding.
+      alpha: [] f32, squared feature distance at which a pair is as good as the slack.
+      beta: [] f32, annealing: how sharply distance counts.
+    """
+
+    target_from_source: RigidTransform
+    log_assignment: jax.Array
+    partners: jax.Array
+    weights: jax.Array
+    alpha: jax.Array
+    beta: jax.Array
+
+
+class FeatureNet(nn.Module):
+    """Local features: shared MLP over neighbours, max, MLP, unit length."""
+
+    width: int = 96
+
+    @nn.compact
+    def __call__(self, xyz: jax.Array, near: Neighborhoods, mask: jax.Array) -> jax.Array:
+        """From xyz [N, 3], neighbourhoods and mask [N] to features [N, width] f32."""
+        shape = (*near.offsets.shape[:2], 3)
+        center = jnp.broadcast_to(xyz[:, None, :], shape)
+        x = jnp.concatenate([center, near.offsets, near.ppf], -1)
+        x = DenseNormRelu(self.width, name="prepool_0")(x, mask)
+        x = DenseNormRelu(self.width, name="prepool_1")(x, mask)
+        rows = jnp.broadcast_to(mask[:, None], shape[:2])
+        x = DenseNormReluMax(2 * self.width, name="prepool_2")(x, rows)
+        x = DenseNormRelu(2 * self.width, name="postpool_0")(x, mask)
+        x = DenseNormRelu(self.width, name="postpool_1")(x, mask)
+        x = nn.Dense(self.width, name="postpool_2")(x)
+        # Padding may be exactly zero here; its length is sanitised, never divided by.
+        squared = jnp.sum(x**2, -1, keepdims=True)
+        return x * jax.lax.rsqrt(jnp.maximum(squared, 1e-20))
+
+
+class AnnealingNet(nn.Module):
+    """Predicts the annealing parameters from the two clouds as they lie now."""
+
+    @nn.compact
+    def __call__(
+        self, source: jax.Array, target: jax.Array, mask: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """From source [N, 3], target [M, 3] and mask [N + M] to (beta [], alpha [])."""
+        flags = [jnp.zeros_like(source[:, :1]), jnp.ones_like(target[:, :1])]
+        x = jnp.concatenate([jnp.concatenate([source, target]), jnp.concatenate(flags)], -1)
+        for index, features in enumerate((64, 64, 64, 128)):
+            x = DenseNormRelu(features, name=f"prepool_{index}")(x, mask)
+        x = DenseNormReluMax(1024, num_groups=16, name="prepool_4")(x, mask)[None, :]
+        one = jnp.ones((1,), bool)
+        x = DenseNormRelu(512, num_groups=16, name="postpool_0")(x, one)
+        x = DenseNormRelu(256, num_groups=16, name="postpool_1")(x, one)
+        beta, alpha = nn.softplus(nn.Dense(2, name="postpool_2")(x))[0]
+        return beta, alpha
+
+
+class RpmNet(nn.Module):
+    """RPM-Net for one pair; `jax.vmap` over pairs.
+
+    Attributes:
+      num_neighbors: K, the paper's k.
+      radius: of the neighbourhood, unit-sphere units.
+      sinkhorn_iterations: rounds of normalisation.
+      feature_width: channels of a feature.
+    """
+
+    num_neighbors: int = 32
+    radius: float = 0.3
+    sinkhorn_iterations: int = 5
+    feature_width: int = 96
+
+    def setup(self) -> None:
+        self.feature_net = FeatureNet(self.feature_width)
+        self.annealing_net = AnnealingNet()
+
+    def neighborhoods(self, cloud: PointCloud) -> Neighborhoods:
+        """Neighbours and point-pair features of a cloud [N]; no parameters take part."""
+        index = ball_query(
+            cloud.xyz, cloud.mask, radius=self.radius, num_neighbors=self.num_neighbors
+        )
+        offsets = cloud.xyz[index] - cloud.xyz[:, None, :]
+        ppf = point_pair_features(offsets, cloud.normals, cloud.normals[index])
+        return Neighborhoods(offsets=offsets, ppf=ppf)
+
+    def features(self, cloud: PointCloud) -> jax.Array:
+        """Features [M, feature_width] of a cloud: for the reference, once per part."""
+        return self.feature_net(cloud.xyz, self.neighborhoods(cloud), cloud.mask)
+
+    def match(
+        self,
+        source: PointCloud,
+        near: Neighborhoods,
+        target: PointCloud,
+        target_features: jax.Array,
+        target_from_source: RigidTransform,
+    ) -> Match:
+        """One iteration from the pose ``target_from_source``, which is held constant."""
+        moved = target_from_source.apply(source.xyz)
+        moved_near = near.replace(
+            offsets=target_from_source.rotate(near.offsets.reshape(-1, 3)).reshape(near.offsets.shape)
+        )
+        features = self.feature_net(moved, moved_near, source.mask)
+        both = jnp.concatenate([source.mask, target.mask])
+        beta, alpha = self.annealing_net(moved, target.xyz, both)
+        # Features have unit length: |f - g|^2 = 2 - 2 f.g
+        distances = 2.0 - 2.0 * jnp.matmul(features, target_features.T)
+        log_assignment = log_sinkhorn(
+            -beta * (distances - alpha),
+            source.mask,
+            target.mask,
+            iterations=self.sinkhorn_iterations,
+        )
+        partners, weights = soft_correspondences(jnp.exp(log_assignment), target.xyz)
+        return Match(
+            target_from_source=weighted_procrustes(source.xyz, partners, weights),
+            log_assignment=log_assignment,
+            partners=partners,
+            weights=weights,
+            alpha=alpha,
+            beta=beta,
+        )
+
+    def __call__(
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        init: RigidTransform,
+        iterations: int,
+        target_features: jax.Array | None = None,
+    ) -> list[Match]:
+        """All iterations from ``init``, the last one last.
+
+        Args:
+          source: [N] points.
+          target: [M] points, the reference.
+          init: target_from_source to start from.
+          iterations: static; 2 in training, 5 at inference as published.
+          target_features: [M, feature_width] from `features`, to share them between pairs.
+        """
+        if target_features is None:
+            target_features = self.features(target)
+        near = self.neighborhoods(source)
+        matches: list[Match] = []
+        pose = init
+        for _ in range(iterations):
+            matches.append(self.match(source, near, target, target_features, pose))
+            pose = jax.lax.stop_gradient(matches[-1].target_from_source)
+        return matches
+
+
+def rpmnet(model: RpmNet, variables: Mapping[str, Any], *, iterations: int = 5) -> Register:
+    """A trained RPM-Net as a `Register`: source and target in unit-sphere units."""
+
+    def register(
+        source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
+    ) -> Registration:
+        del key  # nothing here is random
+        match = model.apply(variables, source, target, init, iterations)[-1]
+        return registration_from_match(source, match, iterations)
+
+    return register
+
+
+def registration_from_match(source: PointCloud, match: Match, iterations: int) -> Registration:
+    """The common result type from the last iteration of RPM-Net."""
+    residual = match.target_from_source.apply(source.xyz) - match.partners
+    total = jnp.maximum(jnp.sum(match.weights), 1e-9)
+    squared = jnp.sum(match.weights * jnp.sum(residual**2, -1)) / total
+    overlap = jnp.sum(match.weights) / jnp.maximum(jnp.sum(source.mask), 1)
+    finite = jnp.all(jnp.isfinite(match.target_from_source.as_matrix()))
+    return Registration(
+        target_from_source=match.target_from_source,
+        converged=finite & (overlap > 1e-3),
+        iterations=jnp.asarray(iterations, jnp.int32),
+        rmse=jnp.sqrt(squared),
+        overlap=overlap,
+    )
+
+
+def variables_from_torch(state_dict: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Flax variables from the published PyTorch state dict, by name.
+
+    Args:
+      state_dict: name to array, as `vanejax.torch_weights.load_state_dict` reads it.
+
+    Raises:
+      InputError: a name is missing or unknown, or a shape is not RPM-Net's.
+    """
+    left = dict(state_dict)
+
+    def take(name: str, ndim: int) -> np.ndarray:
+        if name not in left:
+            raise InputError(f"the state dict has no {name!r}: it is not a published RPM-Net's")
+        value = np.asarray(left.pop(name), np.float32)
+        value = value.reshape(value.shape[:ndim]) if value.size == np.prod(value.shape[:ndim]) else value
+        if value.ndim != ndim:
+            raise InputError(f"{name!r} has shape {value.shape}: expected {ndim} axes")
+        return value
+
+    def dense(name: str) -> dict[str, np.ndarray]:
+        return {"kernel": take(f"{name}.weight", 2).T, "bias": take(f"{name}.bias", 1)}
+
+    def mlp(prefix: str, label: str, count: int, *, normed_last: bool) -> dict[str, Any]:
+        layers: dict[str, Any] = {}
+        for index in range(count):
+            # torch.nn.Sequential numbers the convolution, its norm and its ReLU: steps of three.
+            linear = dense(f"{prefix}.{label}.{3 * index}")
+            if index < count - 1 or normed_last:
+                norm = f"{prefix}.{label}.{3 * index + 1}"
+                layers[f"{label}_{index}"] = {
+                    "dense": linear,
+                    "norm": {"scale": take(f"{norm}.weight", 1), "bias": take(f"{norm}.bias", 1)},
+                }
+            else:
+                layers[f"{label}_{index}"] = linear
+        return layers
+
+    def net(prefix: str, prepool: int) -> dict[str, Any]:
+        return mlp(prefix, "prepool", prepool, normed_last=True) | mlp(
+            prefix, "postpool", 3, normed_last=False
+        )
+
+    params = {"feature_net": net("feat_extractor", 3), "annealing_net": net("weights_net", 5)}
+    if left:
+        raise InputError(f"the state dict has entries RPM-Net lacks: {', '.join(sorted(left)[:5])}")
+    return {"params": params}

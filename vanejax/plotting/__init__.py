@@ -1,0 +1,35 @@
+"""Every figure, once: functions take arrays and give a `matplotlib.figure.Figure`.
+
+No pyplot and no global state: figures are plain values, drawn on an Agg canvas, also in threads
+and without a display.
+"""
+
+from vanejax.plotting.canvas import save_figure
+from vanejax.plotting.charts import AxisErrors, axis_errors, error_map, training_curves
+from vanejax.plotting.clouds import (
+    READER_AZIMUTH_DEG,
+    READER_ELEVATION_DEG,
+    Overlay,
+    registration_overlays,
+    view_and_shadow,
+    view_name,
+)
+from vanejax.plotting.overview import overview_picture
+from vanejax.plotting.shading import part_picture, shade
+
+__all__ = [
+    "READER_AZIMUTH_DEG",
+    "READER_ELEVATION_DEG",
+    "AxisErrors",
+    "Overlay",
+    "axis_errors",
+    "error_map",
+    "overview_picture",
+    "part_picture",
+    "registration_overlays",
+    "save_figure",
+    "shade",
+    "training_curves",
+    "view_and_shadow",
+    "view_name",
+]

@@ -1,0 +1,100 @@
+"""Point clouds with a fixed number of rows: padding, neighbours, thinning."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vanejax.rigid import RigidTransform
+
+
+@flax.struct.dataclass
+class PointCloud:
+    """Points with unit normals; rows past the real ones are padding.
+
+    Attributes:
+      xyz: [..., N, 3] f32, finite in every row (padding repeats real points or is zero).
+      normals: [..., N, 3] f32, unit length in real rows.
+      mask: [..., N] bool, False at padding.
+    """
+
+    xyz: jax.Array
+    normals: jax.Array
+    mask: jax.Array
+
+    @classmethod
+    def create(cls, xyz: jax.Array, normals: jax.Array) -> PointCloud:
+        """A cloud in which every row is real: xyz and normals [..., N, 3]."""
+        return cls(xyz=xyz, normals=normals, mask=jnp.ones(xyz.shape[:-1], bool))
+
+    def transform(self, target_from_source: RigidTransform) -> PointCloud:
+        """Moves the points and turns the normals."""
+        return self.replace(
+            xyz=target_from_source.apply(self.xyz), normals=target_from_source.rotate(self.normals)
+        )
+
+
+def squared_distances(a: jax.Array, b: jax.Array) -> jax.Array:
+    """[N, M] squared distances between a [N, 3] and b [M, 3].
+
+    Sums squared differences, one coordinate at a time: ``|a|^2 + |b|^2 - 2ab`` would lose
+    millimetres on clouds far from the origin, and this form fuses without an [N, M, 3] array.
+    """
+    total = jnp.zeros((), a.dtype)
+    for axis in range(3):
+        total = total + (a[:, None, axis] - b[None, :, axis]) ** 2
+    return total
+
+
+def ball_query(xyz: jax.Array, mask: jax.Array, *, radius: float, num_neighbors: int) -> jax.Array:
+    """The first ``num_neighbors`` other points by index within ``radius``.
+
+    This is RPM-Net's neighbourhood: in index order, not the nearest; the point itself is left out
+    and then fills the places that are left over where there are fewer neighbours.
+
+    Args:
+      xyz: [N, 3] f32, in the unit of ``radius``.
+      mask: [N] bool; padding is no one's neighbour.
+      radius: inclusive.
+      num_neighbors: K.
+
+    Returns:
+      indices [N, K] i32.
+    """
+    itself = jnp.arange(xyz.shape[0], dtype=jnp.int32)
+    other = mask[None, :] & (itself[:, None] != itself[None, :])
+    inside = (squared_distances(xyz, xyz) <= radius**2) & other
+    # The j-th neighbour is where the running count first reaches j: no sort of N x N needed.
+    running = jnp.cumsum(inside, axis=1, dtype=jnp.int32)
+    wanted = jnp.arange(1, num_neighbors + 1, dtype=jnp.int32)
+    found = jax.vmap(lambda row: jnp.searchsorted(row, wanted))(running)
+    return jnp.where(found < xyz.shape[0], found.astype(jnp.int32), itself[:, None])
+
+
+def voxel_thin(points: np.ndarray, *, voxel_mm: float) -> np.ndarray:
+    """Indices of one point per occupied voxel: the one nearest to the voxel's mean point.
+
+    Args:
+      points: [N, 3], mm, on the host.
+      voxel_mm: edge length of the cubic grid, anchored at the origin of the points' frame.
+
+    Returns:
+      indices [n] i64, ascending; real points are kept, so normals and face ids still belong.
+    """
+    points = np.asarray(points, np.float64)
+    if len(points) == 0:
+        return np.zeros(0, np.int64)
+    cells = np.floor(points / voxel_mm).astype(np.int64)
+    cells -= cells.min(axis=0)
+    spans = cells.max(axis=0) + 1
+    flat = (cells[:, 0] * spans[1] + cells[:, 1]) * spans[2] + cells[:, 2]
+    _, cell_of, counts = np.unique(flat, return_inverse=True, return_counts=True)
+    means = np.stack(
+        [np.bincount(cell_of, weights=points[:, k]) / counts for k in range(3)], axis=1
+    )
+    squared = np.sum((points - means[cell_of]) ** 2, axis=1)
+    order = np.lexsort((squared, cell_of))
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    return np.sort(order[first])

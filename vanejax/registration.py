@@ -1,0 +1,41 @@
+"""What every registration algorithm takes and gives."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import flax.struct
+import jax
+
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+
+
+@flax.struct.dataclass
+class Registration:
+    """The result of a registration; a batch is a leading axis.
+
+    Attributes:
+      target_from_source: the total motion, the initial guess included.
+      converged: [] bool; False also where the answer is not finite or rests on no points.
+      iterations: [] i32, iterations done.
+      rmse: [] f32, weighted root mean square distance between moved source points and their
+        partners, in the clouds' unit.
+      overlap: [] f32, share of the source points that found a partner, 0 to 1.
+    """
+
+    target_from_source: RigidTransform
+    converged: jax.Array
+    iterations: jax.Array
+    rmse: jax.Array
+    overlap: jax.Array
+
+
+class Register(Protocol):
+    """One pair in, one pose out: pure, jit-able and vmap-able."""
+
+    def __call__(
+        self, source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
+    ) -> Registration:
+        """Finds target_from_source, starting at ``init``."""
+        ...
