@@ -11,13 +11,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from absl import app, flags
+from absl import app, flags, logging
 from ml_collections import config_flags
 
 from experiments.experiment import Experiment
 from vanejax.errors import InputError
 
 CONFIG_FOLDER = Path(__file__).parent / "configs"
+flags.disclaim_key_flags()  # the flags defined here belong to the command that asks for them
+
 _OVERRIDE = re.compile(r"--?config\.([^=]+)")
 
 
@@ -50,6 +52,7 @@ def run(main: Callable[[], int | None]) -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
     def guarded(rest: list[str]) -> int:
+        logging.set_verbosity(logging.ERROR)  # orbax tells of every file it writes
         try:
             if len(rest) > 1:
                 raise InputError(f"no such argument: {' '.join(rest[1:])}; see --help")
@@ -95,7 +98,7 @@ def resolve_config(argv: list[str]) -> list[str]:
 
 
 def _parse(argv: list[str]) -> list[str]:
-    """absl's parser, with overrides checked first so that a typo lists the right names."""
+    """Absl's parser, with overrides checked first so that a typo lists the right names."""
     overrides = [m.group(1) for a in argv[1:] if (m := _OVERRIDE.match(a))]
     for path in overrides:
         _check_field(path)

@@ -3,8 +3,7 @@
 Every field can be overridden on the command line: ``--config.model.num_neighbors=16``.
 """
 
-from __future__ import annotations
-
+# No ``from __future__ import annotations`` here: the command line reads the fields' types.
 import dataclasses
 from dataclasses import field
 

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from experiments.experiment import Experiment
+from experiments.registrations import Results
 from vanejax import plotting
 from vanejax.camera import hemisphere_viewpoints
 from vanejax.dataset import ScanSet
 from vanejax.part import Part
 from vanejax.scanner import Scanner
 
-if TYPE_CHECKING:
-    from experiments.evaluate import Results
-
 PORTRAIT_PIXELS = 2.0  # times the camera's per side: the picture is printed larger than a scan
+SURFACE_SAMPLES = 100_000  # so dense that hidden surface looks as solid as seen one
 PORTRAIT_DISTANCE = 6.0  # times the part's radius: the near plane must not cut it
 
 
@@ -62,7 +60,8 @@ def draw_with_part(
     folder: Path,
 ) -> None:
     """view_and_shadow.png, Fig. 5 for the hardest views, and overview.png."""
-    scanner, camera, views = Scanner(part), config.make_camera(), scans.viewpoints
+    scanner = Scanner(part, surface_samples=SURFACE_SAMPLES)
+    camera, views = config.make_camera(), scans.viewpoints
     seen = [scanner.scan(camera, views.view(view), hidden=True) for view in hardest]
     names = [
         plotting.view_name(views.elevation_deg[view], views.azimuth_deg[view]) for view in hardest

@@ -35,7 +35,7 @@ class RunFolder:
     def __enter__(self) -> RunFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            self._lock = open(self.path / ".lock", "w")  # noqa: SIM115 (held until exit)
+            self._lock = open(self.path / ".lock", "w")
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InputError(
@@ -82,7 +82,7 @@ class RunFolder:
                 )
             return
         environment = {
-            "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+            "versions": versions(),
             "python": platform.python_version(),
             "commit": git_commit(),
             "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -145,6 +145,17 @@ def write_text(path: Path, text: str) -> None:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def versions() -> dict[str, str | None]:
+    """Installed versions of the packages that a result rests on; None where run from a checkout."""
+    found: dict[str, str | None] = {}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found
 
 
 def git_commit() -> str | None:

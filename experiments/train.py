@@ -26,6 +26,7 @@ from experiments.run_folder import RunFolder
 from vanejax.checkpoint import Checkpoints, all_finite, restore_or
 from vanejax.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
 from vanejax.pairs import Drawing, ScanBank, draw_pairs, make_bank
+from vanejax.part import Part
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.training import (
@@ -34,7 +35,7 @@ from vanejax.training import (
     Variables,
     init_state,
     make_train_step,
-    pose_errors,
+    pose_metrics,
 )
 
 DIVERGED = 20.0  # times the loss of the first rows: no run of use comes back from there
@@ -56,7 +57,7 @@ class Interrupted(RuntimeError):
         self.signal = number
 
 
-def train(config: Experiment, workdir: Path) -> TrainState:
+def train(config: Experiment, workdir: Path) -> None:
     """Trains to the end, resuming what ``workdir`` holds, and evaluates on the test views.
 
     Raises:
@@ -70,7 +71,7 @@ def train(config: Experiment, workdir: Path) -> TrainState:
         folder.claim(config, part)
         scans = load_or_scan(config, part, folder.path / "scans.npz")
         state = fit(config, scans, folder)
-    return state
+        evaluate(config, scans, state.average, workdir, part=part)
 
 
 def load_or_scan(config: Experiment, part: Part, path: Path) -> ScanSet:
@@ -88,7 +89,11 @@ def load_or_scan(config: Experiment, part: Part, path: Path) -> ScanSet:
 def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
     """Trains on the training views of ``scans``; the test views are not looked at."""
     settings = config.training
-    model, optimizer, drawing = config.make_model(), config.make_optimizer(), config.make_drawing(scans)
+    model, optimizer, drawing = (
+        config.make_model(),
+        config.make_optimizer(),
+        config.make_drawing(scans),
+    )
     bank = make_bank(scans.train, num_reference=config.data.num_reference)
     step = make_train_step(
         model,
@@ -182,7 +187,7 @@ def make_validation(
             source, truth = pair
             init, iterations = RigidTransform.identity(), config.model.test_iterations
             matches = model.apply(variables, source, pairs.target, init, iterations, features)
-            return pose_errors(matches[-1].target_from_source, truth)
+            return pose_metrics(matches[-1].target_from_source, truth)
 
         return jax.lax.map(one, (pairs.source, pairs.target_from_source))
 
@@ -227,7 +232,7 @@ def average(rows: list[Metrics], radius_mm: float) -> dict[str, float]:
 def main(config: Experiment, workdir: Path) -> int:
     """Trains, evaluates and reports; the exit code."""
     try:
-        state = train(config, workdir)
+        train(config, workdir)
     except Interrupted as stop:
         print(f"{stop}; saved in {workdir}. Run the same command to go on.", file=sys.stderr)
         return 128 + stop.signal
@@ -238,8 +243,6 @@ def main(config: Experiment, workdir: Path) -> int:
             file=sys.stderr,
         )
         return 1
-    scans = load_scan_set(workdir / "scans.npz")
-    evaluate(config, scans, state.average, workdir)
     return 0
 
 

@@ -48,7 +48,10 @@ def test_the_last_and_the_best_are_kept(tmp_path) -> None:
 def test_without_a_checkpoint_the_fresh_state_is_used(tmp_path) -> None:
     fresh = make_state(0)
     assert restore_or(tmp_path / "new", fresh, keep=2) is fresh
-    with Checkpoints(tmp_path / "new") as checkpoints, pytest.raises(InputError, match="train first"):
+    with (
+        Checkpoints(tmp_path / "new") as checkpoints,
+        pytest.raises(InputError, match="train first"),
+    ):
         checkpoints.restore(fresh)
 
 

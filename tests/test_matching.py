@@ -60,14 +60,13 @@ def test_log_sinkhorn_is_the_loop(rounds, scale):
 
 
 def test_rows_and_columns_hold_at_most_one():
-    excess = []
-    for rounds in (1, 2, 5, 30):
-        assignment = np.exp(log_assignment(affinities(), iterations=rounds))
-        assert assignment.min() > 0
-        assert assignment.sum(axis=0).max() <= 1 + 1e-14  # normalised last; f64 eps x N
-        excess.append(assignment.sum(axis=1).max() - 1)
-    assert sorted(excess, reverse=True) == excess  # rows reach it only in the limit
-    assert excess[-1] < 1e-3 < excess[0]
+    """Rows too, though columns are normalised last: the column potentials only ever grow."""
+    for affinity in (affinities(), affinities() + 20, affinities(30.0)):
+        for rounds in (1, 2, 5):
+            assignment = np.exp(log_assignment(affinity, iterations=rounds))
+            assert assignment.min() >= 0
+            assert assignment.sum(axis=0).max() <= 1 + 1e-12  # f64 eps x 90 x N
+            assert assignment.sum(axis=1).max() <= 1 + 1e-12
 
 
 def test_strong_affinities_match_and_weak_ones_go_to_the_slack():
@@ -115,8 +114,9 @@ def test_extreme_affinities_stay_finite(level, dtype):
     affinity = affinity.astype(dtype)
     assert np.isfinite(mass_gradient(affinity)).all()
     # f32 eps x 1e4 is how well the logarithms are known
-    columns = np.exp(log_assignment(affinity)).sum(axis=0)
-    assert columns.max() <= 1 + 30 * 1e4 * np.finfo(dtype).eps
+    assignment = np.exp(log_assignment(affinity))
+    for axis in (0, 1):
+        assert assignment.sum(axis).max() <= 1 + 30 * 1e4 * np.finfo(dtype).eps
 
 
 def test_nothing_to_match():

@@ -230,7 +230,11 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) ->
             raise InputError(f"{path}: {entry.filename} has array format {version}, expected 1.0")
         shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
         data = file.read()
-    if dtype.hasobject or fortran or len(data) != int(np.prod(shape, dtype=object)) * dtype.itemsize:
+    if (
+        dtype.hasobject
+        or fortran
+        or len(data) != int(np.prod(shape, dtype=object)) * dtype.itemsize
+    ):
         raise InputError(f"{path}: {entry.filename} does not hold the array that it announces")
     return np.frombuffer(data, dtype).reshape(shape)
 
@@ -250,9 +254,7 @@ def _read_header(raw: np.ndarray | None, path: Path) -> dict[str, Any]:
     return header
 
 
-def _from_arrays(
-    arrays: dict[str, np.ndarray], header: dict[str, Any], path: Path
-) -> ScanSet:
+def _from_arrays(arrays: dict[str, np.ndarray], header: dict[str, Any], path: Path) -> ScanSet:
     try:
         viewpoints = Viewpoints(
             elevation_deg=arrays["elevation_deg"],

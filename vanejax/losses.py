@@ -10,9 +10,7 @@ from vanejax.pointcloud import PointCloud, squared_distances
 from vanejax.rigid import RigidTransform
 
 
-def pose_loss(
-    match: Match, source: PointCloud, target_from_source: RigidTransform
-) -> jax.Array:
+def pose_loss(match: Match, source: PointCloud, target_from_source: RigidTransform) -> jax.Array:
     """Mean absolute difference of coordinates between the source under the found and true motion.
 
     Source: RPM-Net, section 4.4 (L_reg). [] f32, unit-sphere units.
@@ -62,9 +60,7 @@ def matching_loss(
     return jnp.sum(entropy, where=source.mask) / jnp.maximum(jnp.sum(source.mask), 1)
 
 
-def partner_loss(
-    match: Match, source: PointCloud, target_from_source: RigidTransform
-) -> jax.Array:
+def partner_loss(match: Match, source: PointCloud, target_from_source: RigidTransform) -> jax.Array:
     """Mean distance between each soft correspondence and the point's true place.
 
     [] f32, unit-sphere units. Every point counts alike: the weights that the pose is solved with

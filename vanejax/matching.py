@@ -23,8 +23,8 @@ def log_sinkhorn(
       iterations: rounds of one row and one column normalisation.
 
     Returns:
-      log assignment [N, M] f32. Its exponential has columns that sum to at most 1 and, in the
-      limit, rows too. At padding it is finite and very negative, its exponential exactly zero.
+      log assignment [N, M] f32. Its exponential has rows and columns that sum to at most 1. At
+      padding it is finite and very negative, its exponential exactly zero.
     """
     real = source_mask[:, None] & target_mask[None, :]
     # exp(-1e9) is exactly 0 in f32, and unlike -inf it never makes a NaN in a gradient.

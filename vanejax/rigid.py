@@ -155,7 +155,8 @@ def log_so3(rotation: jax.Array) -> jax.Array:
     )
     squared = jnp.sum(candidates**2, -1)
     best = jnp.argmax(squared, -1)[..., None, None]
-    q = jnp.take_along_axis(candidates, jnp.broadcast_to(best, (*best.shape[:-1], 4)), -2)[..., 0, :]
+    row = jnp.broadcast_to(best, (*best.shape[:-1], 4))
+    q = jnp.take_along_axis(candidates, row, -2)[..., 0, :]
     q = q / jnp.linalg.norm(q, axis=-1, keepdims=True)
     q = jnp.where(q[..., :1] < 0, -q, q)
     squared = jnp.sum(q[..., 1:] ** 2, -1)

@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import optax
 
 from vanejax import losses
+from vanejax.metrics import rotation_error_deg, translation_error
 from vanejax.models.rpmnet import Match, RpmNet
 from vanejax.pairs import Drawing, Pair, ScanBank, draw_pairs
-from vanejax.rigid import RigidTransform, rotation_angle
+from vanejax.rigid import RigidTransform
 
 Metrics = dict[str, jax.Array]
 Variables = Any
@@ -98,7 +99,7 @@ class RpmNetLoss:
             for index, match in enumerate(matches):
                 value, parts = self.of_match(match, source, pair)
                 total += self.discount ** (self.iterations - 1 - index) * value
-            return total, parts | pose_errors(matches[-1].target_from_source, truth)
+            return total, parts | pose_metrics(matches[-1].target_from_source, truth)
 
         # Forward again in the backward pass: a third cheaper on a CPU than reading the activations
         # of several pairs back from memory, and a quarter of the memory.
@@ -110,12 +111,11 @@ class RpmNetLoss:
         return jnp.mean(total), jax.tree.map(jnp.mean, metrics)
 
 
-def pose_errors(found: RigidTransform, truth: RigidTransform) -> Metrics:
-    """Rotation error in degrees and translation error at the target's origin, in its unit."""
-    error = found @ truth.inverse()
+def pose_metrics(found: RigidTransform, truth: RigidTransform) -> Metrics:
+    """Rotation error in degrees and translation error in unit-sphere units, [...] each."""
     return {
-        "rotation_error_deg": jnp.rad2deg(rotation_angle(error.rotation)),
-        "translation_error": jnp.linalg.norm(error.translation),
+        "rotation_error_deg": rotation_error_deg(found, truth),
+        "translation_error": translation_error(found, truth),
     }
 
 
@@ -147,11 +147,15 @@ def init_state(
     seed: int,
 ) -> TrainState:
     """The state before the first step; the same seed gives the same state."""
-    key = jax.random.key(seed)
-    pairs = draw_pairs(key, bank, jnp.zeros((1,), jnp.int32), drawing)
-    source = jax.tree.map(lambda leaf: leaf[0], pairs.source)
-    init = jax.jit(lambda key: model.init(key, source, pairs.target, RigidTransform.identity(), 1))
-    variables = init(key)
+
+    @jax.jit
+    def init(key: jax.Array) -> Variables:
+        # Only the shapes of a pair matter here: inside the jit nothing of it is computed.
+        pairs = draw_pairs(key, bank, jnp.zeros((1,), jnp.int32), drawing)
+        source = jax.tree.map(lambda leaf: leaf[0], pairs.source)
+        return model.init(key, source, pairs.target, RigidTransform.identity(), 1)
+
+    variables = init(jax.random.key(seed))
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         variables=variables,

@@ -10,6 +10,7 @@ Coordinates are in unit-sphere units: the part's centre is the origin, its radiu
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from typing import Any
 
@@ -147,9 +148,8 @@ class RpmNet(nn.Module):
     ) -> Match:
         """One iteration from the pose ``target_from_source``, which is held constant."""
         moved = target_from_source.apply(source.xyz)
-        moved_near = near.replace(
-            offsets=target_from_source.rotate(near.offsets.reshape(-1, 3)).reshape(near.offsets.shape)
-        )
+        turned = target_from_source.rotate(near.offsets.reshape(-1, 3))
+        moved_near = near.replace(offsets=turned.reshape(near.offsets.shape))
         features = self.feature_net(moved, moved_near, source.mask)
         both = jnp.concatenate([source.mask, target.mask])
         beta, alpha = self.annealing_net(moved, target.xyz, both)
@@ -235,43 +235,45 @@ def variables_from_torch(state_dict: Mapping[str, np.ndarray]) -> dict[str, Any]
       state_dict: name to array, as `vanejax.torch_weights.load_state_dict` reads it.
 
     Raises:
-      InputError: a name is missing or unknown, or a shape is not RPM-Net's.
+      InputError: a name is missing or unknown, a shape is not RPM-Net's, a value not finite.
     """
     left = dict(state_dict)
 
-    def take(name: str, ndim: int) -> np.ndarray:
+    def take(name: str, *shape: int) -> np.ndarray:
         if name not in left:
             raise InputError(f"the state dict has no {name!r}: it is not a published RPM-Net's")
         value = np.asarray(left.pop(name), np.float32)
-        value = value.reshape(value.shape[:ndim]) if value.size == np.prod(value.shape[:ndim]) else value
-        if value.ndim != ndim:
-            raise InputError(f"{name!r} has shape {value.shape}: expected {ndim} axes")
-        return value
+        # the kernel of a convolution has one or two axes of length 1 behind these
+        if value.shape[: len(shape)] != shape or value.size != np.prod(shape):
+            raise InputError(f"{name!r} has shape {value.shape}: RPM-Net's has {shape}")
+        if not np.isfinite(value).all():
+            raise InputError(f"{name!r} holds values that are not finite: its training diverged")
+        return value.reshape(shape)
 
-    def dense(name: str) -> dict[str, np.ndarray]:
-        return {"kernel": take(f"{name}.weight", 2).T, "bias": take(f"{name}.bias", 1)}
-
-    def mlp(prefix: str, label: str, count: int, *, normed_last: bool) -> dict[str, Any]:
+    def mlp(prefix: str, label: str, widths: tuple[int, ...], *, normed_last: bool) -> dict:
         layers: dict[str, Any] = {}
-        for index in range(count):
+        for index, (channels, features) in enumerate(itertools.pairwise(widths)):
             # torch.nn.Sequential numbers the convolution, its norm and its ReLU: steps of three.
-            linear = dense(f"{prefix}.{label}.{3 * index}")
-            if index < count - 1 or normed_last:
-                norm = f"{prefix}.{label}.{3 * index + 1}"
-                layers[f"{label}_{index}"] = {
-                    "dense": linear,
-                    "norm": {"scale": take(f"{norm}.weight", 1), "bias": take(f"{norm}.bias", 1)},
-                }
-            else:
-                layers[f"{label}_{index}"] = linear
+            dense, norm = (f"{prefix}.{label}.{3 * index + offset}" for offset in (0, 1))
+            layer = {
+                "kernel": take(f"{dense}.weight", features, channels).T,
+                "bias": take(f"{dense}.bias", features),
+            }
+            if normed_last or index < len(widths) - 2:
+                gain, bias = take(f"{norm}.weight", features), take(f"{norm}.bias", features)
+                layer = {"dense": layer, "norm": {"scale": gain, "bias": bias}}
+            layers[f"{label}_{index}"] = layer
         return layers
 
-    def net(prefix: str, prepool: int) -> dict[str, Any]:
+    def net(prefix: str, prepool: tuple[int, ...], postpool: tuple[int, ...]) -> dict[str, Any]:
         return mlp(prefix, "prepool", prepool, normed_last=True) | mlp(
-            prefix, "postpool", 3, normed_last=False
+            prefix, "postpool", postpool, normed_last=False
         )
 
-    params = {"feature_net": net("feat_extractor", 3), "annealing_net": net("weights_net", 5)}
+    params = {
+        "feature_net": net("feat_extractor", (10, 96, 96, 192), (192, 192, 96, 96)),
+        "annealing_net": net("weights_net", (4, 64, 64, 64, 128, 1024), (1024, 512, 256, 2)),
+    }
     if left:
         raise InputError(f"the state dict has entries RPM-Net lacks: {', '.join(sorted(left)[:5])}")
     return {"params": params}

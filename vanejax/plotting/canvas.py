@@ -20,9 +20,10 @@ FAINT = "#8a8f98"
 GRID = "#e3e5e8"
 
 
-def new_figure(width_in: float, height_in: float, *, layout: str = "constrained") -> Figure:
-    """An empty figure on an Agg canvas; ``layout="compressed"`` suits panels of equal aspect."""
-    figure = Figure(figsize=(width_in, height_in), layout=layout, facecolor="white")
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure on an Agg canvas, whose panels arrange themselves without overlap."""
+    figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+    figure.get_layout_engine().set(w_pad=0.08, h_pad=0.08)
     FigureCanvasAgg(figure)
     return figure
 

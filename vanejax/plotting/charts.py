@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
 from vanejax.errors import InputError
+from vanejax.metrics import mean_per_axis, mean_per_view
 from vanejax.plotting.canvas import GRID, INK, new_figure, style_chart
 
 # distinguishable for every kind of colour vision (Okabe and Ito, 2008)
@@ -40,8 +41,10 @@ def error_map(
     """Errors of V views over azimuth and elevation, a cell with its value for each view.
 
     Args:
-      elevation_deg, azimuth_deg: [V] viewpoints; they need not fill the grid.
-      rotation_deg, translation_mm: [V] errors; not finite ones are marked "failed".
+      elevation_deg: [V] of the viewpoints, which need not fill the grid.
+      azimuth_deg: [V].
+      rotation_deg: [V] errors; not finite ones are marked "failed".
+      translation_mm: [V] errors, likewise.
     """
     elevations, row = np.unique(elevation_deg, return_inverse=True)
     azimuths, column = np.unique(azimuth_deg, return_inverse=True)
@@ -81,38 +84,64 @@ def axis_errors(series: Mapping[str, AxisErrors]) -> Figure:
         raise InputError("axis_errors needs at least one series")
     figure = new_figure(11.0, 6.4)
     panels = figure.subplots(2, 2, gridspec_kw={"width_ratios": (1, 2.2)})
-    for line, (name, unit, field) in enumerate(
-        (("rotation", "deg", "rotation_deg"), ("translation", "mm", "translation_mm"))
+    for (bars, lines), name, unit, equations in (
+        (panels[0], "rotation", "deg", ("MRE, eq. 8", "MRE, eq. 10")),
+        (panels[1], "translation", "mm", ("MTE, eq. 9", "MTE, eq. 11")),
     ):
-        bars, lines = panels[line]
-        width = 0.72 / len(series)
-        for index, (label, errors) in enumerate(series.items()):
-            values = np.asarray(getattr(errors, field), np.float64)
-            color = SERIES[index % len(SERIES)]
-            place = np.arange(3) + (index - (len(series) - 1) / 2) * width
-            with np.errstate(invalid="ignore"):
-                finite = np.isfinite(values).all(axis=1)
-            heights = values[finite].mean(axis=0) if finite.any() else np.full(3, np.nan)
-            container = bars.bar(place, heights, 0.94 * width, color=color, label=label)
-            bars.bar_label(container, fmt="%.2f", padding=2, color=INK, fontsize=9)
-            views = np.arange(1, len(values) + 1)
-            per_view = values.mean(axis=1)
-            lines.plot(views, per_view, "o-", color=color, markersize=3.5, linewidth=1.1)
-            lines.plot(views[~finite], np.zeros((~finite).sum()), "x", color=color, clip_on=False)
-        style_chart(bars, title=f"mean {name} error per axis", ylabel=unit)
-        bars.set_xticks(range(3), ["x", "y", "z"])
-        bars.tick_params(axis="x", length=0)
-        bars.margins(y=0.14)
-        style_chart(lines, title=f"mean {name} error over the axes, per view", ylabel=unit)
-        lines.set_xlabel("test view" if line else "", color=INK, fontsize=10)
-        lines.set_ylim(bottom=0)
-        lines.xaxis.set_major_locator(MaxNLocator(integer=True))
+        values = {
+            label: np.asarray(getattr(errors, f"{name}_{unit}"), np.float64)
+            for label, errors in series.items()
+        }
+        _axis_bars(bars, values)
+        _view_lines(lines, values)
+        style_chart(bars, title=f"{name} error per axis ({equations[0]})", ylabel=unit)
+        title = f"{name} error per view, mean over the axes ({equations[1]})"
+        style_chart(lines, title=title, ylabel=unit)
+    order = "test view, in the order of elevation, then azimuth"
+    panels[1, 1].set_xlabel(order, color=INK, fontsize=10)
     if len(series) > 1:
         figure.legend(
             *panels[0, 0].get_legend_handles_labels(), loc="outside upper right",
             ncols=len(series), frameon=False, labelcolor=INK,
         )  # fmt: skip
     return figure
+
+
+def _axis_bars(axes: Axes, series: Mapping[str, np.ndarray]) -> None:
+    """Bars of the means over views, for each series [V, 3] of errors; failed views left out."""
+    width = 0.72 / len(series)
+    for index, (label, values) in enumerate(series.items()):
+        finite = np.isfinite(values).all(axis=1)
+        heights = mean_per_axis(values[finite]) if finite.any() else np.full(3, np.nan)
+        bars = axes.bar(
+            np.arange(3) + (index - (len(series) - 1) / 2) * width,
+            np.asarray(heights),
+            0.94 * width,
+            color=SERIES[index % len(SERIES)],
+            label=label,
+        )
+        axes.bar_label(bars, fmt="%.2f", padding=2, color=INK, fontsize=9)
+    axes.set_xticks(range(3), ["x", "y", "z"])
+    axes.tick_params(axis="x", length=0)
+    axes.margins(y=0.14)
+
+
+def _view_lines(axes: Axes, series: Mapping[str, np.ndarray]) -> None:
+    """Lines of the means over axes, for each series [V, 3]; failed views are crosses at 0."""
+    for index, values in enumerate(series.values()):
+        color = SERIES[index % len(SERIES)]
+        views = np.arange(1, len(values) + 1)
+        axes.plot(
+            views, np.asarray(mean_per_view(values)), "o-", color=color, markersize=3.5,
+            linewidth=1.1,
+        )  # fmt: skip
+        lost = views[~np.isfinite(values).all(axis=1)]
+        if len(lost):
+            axes.plot(lost, np.zeros(len(lost)), "x", color=color, label="failed")
+            axes.legend(frameon=False, fontsize=9, labelcolor=INK)
+    axes.set_ylim(bottom=0)
+    axes.set_xlim(0.3, max(map(len, series.values())) + 0.7)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def training_curves(rows: Sequence[Mapping[str, float]]) -> Figure:
@@ -150,7 +179,7 @@ def training_curves(rows: Sequence[Mapping[str, float]]) -> Figure:
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=6, steps=(1, 2, 5, 10), integer=True))
     if not drawn:
         raise InputError("training_curves: the log has no loss and no errors")
     return figure

@@ -19,6 +19,7 @@ from vanejax.scanner import Scan
 # Where the reader stands, as a viewpoint of the hemisphere: oblique enough to see a tilt.
 READER_ELEVATION_DEG = 50.0
 READER_AZIMUTH_DEG = 325.0
+_COLUMN_IN = 2.55
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -68,22 +69,19 @@ def registration_overlays(overlays: Sequence[Overlay]) -> Figure:
     """
     if not overlays:
         raise InputError("registration_overlays needs at least one registration")
-    reach = [
-        np.nanmax(np.abs(_flat(cloud)[:, :2]), axis=0, initial=1.0)
-        for overlay in overlays
-        for cloud in (overlay.source, overlay.reference)
-    ]
-    half_width, half_height = 1.04 * np.max(reach, axis=0)
-    column_in = 2.55
-    panel_in = column_in * half_height / half_width
-    figure = new_figure(column_in * len(overlays) + 0.3, 2 * panel_in + 1.4, layout="compressed")
-    rows = figure.subplots(2, len(overlays), squeeze=False)
+    befores = [(overlay.source, overlay.reference) for overlay in overlays]
+    afters = [(overlay.moved, overlay.reference) for overlay in overlays]
+    row_limits = [limits([cloud for pair in row for cloud in pair]) for row in (befores, afters)]
+    heights = [_COLUMN_IN * height_per_width(limit) for limit in row_limits]
+    size = (_COLUMN_IN * len(overlays) + 0.3, sum(heights) + 1.5)
+    figure = new_figure(*size)
+    rows = figure.subplots(2, len(overlays), squeeze=False, gridspec_kw={"height_ratios": heights})
     for column, overlay in enumerate(overlays):
-        reference = _Dots(overlay.reference, REFERENCE_RED, 1.6)
-        for axes, source in zip(rows[:, column], (overlay.source, overlay.moved), strict=True):
-            _draw(axes, [reference, _Dots(source, SOURCE_GREEN, 5.0)])
-            axes.set_xlim(-half_width, half_width)
-            axes.set_ylim(-half_height, half_height)
+        for axes, limit, source in zip(
+            rows[:, column], row_limits, (overlay.source, overlay.moved), strict=True
+        ):
+            draw_overlay(axes, source, overlay.reference)
+            set_limits(axes, limit)
         rows[0, column].set_title(
             f"elevation {overlay.elevation_deg:g}°, azimuth {overlay.azimuth_deg:g}°\n"
             f"{100 * overlay.visible_fraction:.0f} % visible",
@@ -104,7 +102,8 @@ def registration_overlays(overlays: Sequence[Overlay]) -> Figure:
             0.0, 0.5, name, transform=axes.transAxes, rotation=90, ha="right", va="center",
             color=INK, fontsize=11, fontweight="bold",
         )  # fmt: skip
-    _scale_bar(rows[1, 0])
+    for axes in rows[:, 0]:
+        _scale_bar(axes)
     _cloud_legend(figure, "source (virtual scan)", "reference (CAD)")
     return figure
 
@@ -129,18 +128,15 @@ def view_and_shadow(
     columns = min(len(scans), 3)
     lines = -(-len(scans) // columns)
     pictures = [seen_and_hidden(scan, voxel_mm=voxel_mm) for scan in scans]
-    flat = np.concatenate([_flat(cloud)[:, :2] for pair in pictures for cloud in pair])
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    width, height = high - low
+    limit = limits([cloud for pair in pictures for cloud in pair])
     panel_in = 3.6
-    size = (panel_in * columns, (panel_in * height / width + 0.3) * lines + 0.4)
-    figure = new_figure(*size, layout="compressed")
+    size = (panel_in * columns, (panel_in * height_per_width(limit) + 0.3) * lines + 0.4)
+    figure = new_figure(*size)
     panels = figure.subplots(lines, columns, squeeze=False).ravel()
     for axes, (seen, hidden), name in zip(panels, pictures, names, strict=False):
         draw_view(axes, seen, hidden)
         axes.set_title(name, color=INK, fontsize=10)
-        axes.set_xlim(low[0] - 2, high[0] + 2)
-        axes.set_ylim(low[1] - 0.05 * height, high[1] + 2)
+        set_limits(axes, limit)
     for axes in panels[len(scans) :]:
         axes.set_axis_off()
     _scale_bar(panels[0])
@@ -164,12 +160,12 @@ def seen_and_hidden(scan: Scan, *, voxel_mm: float) -> tuple[np.ndarray, np.ndar
 
 def draw_view(axes: Axes, seen: np.ndarray, hidden: np.ndarray) -> None:
     """Seen and hidden points [N, 3] into axes."""
-    _draw(axes, [_Dots(hidden, REFERENCE_RED, 3.5), _Dots(seen, SOURCE_GREEN, 3.5)])
+    _draw(axes, [_Dots(hidden, REFERENCE_RED, 11.0), _Dots(seen, SOURCE_GREEN, 11.0)])
 
 
 def draw_overlay(axes: Axes, source: np.ndarray, reference: np.ndarray) -> None:
     """Source [N, 3] on reference [M, 3] into axes."""
-    _draw(axes, [_Dots(reference, REFERENCE_RED, 1.6), _Dots(source, SOURCE_GREEN, 5.0)])
+    _draw(axes, [_Dots(reference, REFERENCE_RED, 2.5), _Dots(source, SOURCE_GREEN, 6.5)])
 
 
 def _flat(points: np.ndarray) -> np.ndarray:
@@ -177,6 +173,32 @@ def _flat(points: np.ndarray) -> np.ndarray:
     a, b = np.radians([READER_ELEVATION_DEG, READER_AZIMUTH_DEG])
     eye = np.array([np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)])
     return look_at(eye, np.zeros(3)).rotate(np.asarray(points, np.float64))
+
+
+def limits(clouds: Sequence[np.ndarray]) -> np.ndarray:
+    """Lowest and highest (x, y) [2, 2] of clouds as the reader sees them, with margins.
+
+    The one below is for the scale bar.
+    """
+    flat = np.concatenate([_flat(cloud)[:, :2] for cloud in clouds])
+    flat = flat[np.isfinite(flat).all(axis=1)]
+    if not len(flat):
+        flat = np.array([[-1.0, -1.0], [1.0, 1.0]])
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    pad = 0.02 * np.max(high - low)
+    return np.stack([low - [pad, 4 * pad], high + pad])
+
+
+def height_per_width(limit: np.ndarray) -> float:
+    """Proportions of limits [2, 2]."""
+    width, height = limit[1] - limit[0]
+    return height / width
+
+
+def set_limits(axes: Axes, limit: np.ndarray) -> None:
+    """Shows what lies in limits [2, 2], lowest and highest (x, y)."""
+    axes.set_xlim(limit[:, 0])
+    axes.set_ylim(limit[:, 1])
 
 
 def _draw(axes: Axes, clouds: Sequence[_Dots]) -> None:
@@ -192,7 +214,7 @@ def _draw(axes: Axes, clouds: Sequence[_Dots]) -> None:
         return
     depth = flat[:, 2]
     far = (depth.max() - depth) / max(float(np.ptp(depth)), 1e-9)
-    colors = colors + (1 - colors) * 0.55 * far[:, None]
+    colors = colors + (1 - colors) * 0.45 * far[:, None]
     order = np.argsort(depth, kind="stable")
     axes.scatter(
         flat[order, 0], flat[order, 1], s=areas[order], c=colors[order], linewidths=0, zorder=2
@@ -200,13 +222,13 @@ def _draw(axes: Axes, clouds: Sequence[_Dots]) -> None:
 
 
 def _scale_bar(axes: Axes, length_mm: float = 20.0) -> None:
-    """A bar of known length in the lower left corner."""
+    """A bar of known length in the lower left corner, which `limits` keeps free."""
     left, right = axes.get_xlim()
     bottom, top = axes.get_ylim()
-    x, y = left + 0.04 * (right - left), bottom + 0.03 * (top - bottom)
+    x, y = left + 0.02 * (right - left), bottom + 0.01 * (top - bottom)
     axes.plot([x, x + length_mm], [y, y], color=INK, linewidth=2, solid_capstyle="butt")
     axes.text(
-        x + length_mm / 2, y + 0.02 * (top - bottom), f"{length_mm:g} mm", color=INK, fontsize=8,
+        x + length_mm / 2, y + 0.012 * (top - bottom), f"{length_mm:g} mm", color=INK, fontsize=8,
         ha="center", va="bottom",
     )  # fmt: skip
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
@@ -9,9 +11,19 @@ from matplotlib.patches import ConnectionPatch
 
 from vanejax.camera import Camera
 from vanejax.plotting.canvas import FAINT, INK, REFERENCE_RED, SOURCE_GREEN, new_figure
-from vanejax.plotting.clouds import Overlay, draw_overlay, draw_view, seen_and_hidden
-from vanejax.plotting.shading import draw_part, shade
+from vanejax.plotting.clouds import (
+    Overlay,
+    draw_overlay,
+    draw_view,
+    height_per_width,
+    limits,
+    seen_and_hidden,
+    set_limits,
+)
+from vanejax.plotting.shading import crop, draw_part, shade
 from vanejax.scanner import Scan
+
+_HEIGHT_IN, _GAP_IN = 3.4, 0.7
 
 
 def overview_picture(portrait: Scan, camera: Camera, scan: Scan, overlay: Overlay) -> Figure:
@@ -23,13 +35,25 @@ def overview_picture(portrait: Scan, camera: Camera, scan: Scan, overlay: Overla
       scan: the view that is registered, with `Scan.hidden`.
       overlay: its registration.
     """
-    figure = new_figure(16.0, 3.9)
-    panels = figure.subplots(1, 4, gridspec_kw={"width_ratios": (1.0, 1.0, 1.15, 1.0)})
+    rows, columns = crop(portrait, camera)
+    wide, high = (columns.stop - columns.start) / camera.fx, (rows.stop - rows.start) / camera.fy
+    pictures = (
+        seen_and_hidden(scan, voxel_mm=1.0),
+        (overlay.source, overlay.reference),
+        (overlay.moved, overlay.reference),
+    )
+    frames = [limits(clouds) for clouds in pictures]
+    widths = [wide / high] + [1 / height_per_width(frame) for frame in frames]
+    figure = new_figure(_HEIGHT_IN * sum(widths) + 3 * _GAP_IN, _HEIGHT_IN + 0.7)
+    figure.get_layout_engine().set(wspace=4 * _GAP_IN / (_HEIGHT_IN * sum(widths)))
+    panels = figure.subplots(1, 4, gridspec_kw={"width_ratios": widths})
     draw_part(panels[0], portrait, camera, shade(portrait, camera))
-    draw_view(panels[1], *seen_and_hidden(scan, voxel_mm=1.0))
-    draw_overlay(panels[2], overlay.source, overlay.reference)
-    draw_overlay(panels[3], overlay.moved, overlay.reference)
-    _caption(panels[0], "CAD part", [("its shape is all that is given", FAINT)])
+    for axes, clouds, frame, drawn in zip(
+        panels[1:], pictures, frames, (draw_view, draw_overlay, draw_overlay), strict=True
+    ):
+        drawn(axes, *clouds)
+        set_limits(axes, frame)
+    _caption(panels[0], "CAD part", [("all that is given", FAINT)])
     _caption(
         panels[1],
         "virtual scan",
@@ -42,7 +66,7 @@ def overview_picture(portrait: Scan, camera: Camera, scan: Scan, overlay: Overla
     )
     error = f"{overlay.rotation_error_deg:.2f}°, {overlay.translation_error_mm:.2f} mm off"
     _caption(panels[3], "after registration", [(error, FAINT)])
-    for left, right in zip(panels[:-1], panels[1:], strict=True):
+    for left, right in itertools.pairwise(panels):
         _arrow(figure, left, right)
     return figure
 

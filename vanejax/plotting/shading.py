@@ -35,7 +35,7 @@ def shade(scan: Scan, camera: Camera) -> np.ndarray:
     normals = scan.normals.astype(np.float64)
     to_camera = -scan.points / np.linalg.norm(scan.points, axis=1, keepdims=True)
     key, fill = (light / np.linalg.norm(light) for light in (_KEY_LIGHT, _FILL_LIGHT))
-    diffuse = 0.30 + 0.62 * np.maximum(normals @ key, 0) + 0.18 * np.maximum(normals @ fill, 0)
+    diffuse = 0.40 + 0.55 * np.maximum(normals @ key, 0) + 0.20 * np.maximum(normals @ fill, 0)
     half = to_camera + key
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     highlight = 0.22 * np.maximum(np.sum(normals * half, axis=1), 0) ** 40
@@ -59,8 +59,9 @@ def part_picture(scan: Scan, camera: Camera) -> Figure:
     rows, columns = crop(scan, camera)
     wide = (columns.stop - columns.start) / camera.fx
     high = (rows.stop - rows.start) / camera.fy
-    figure = new_figure(8.0, 8.0 * high / wide, layout="none")
-    draw_part(figure.add_axes((0.0, 0.0, 1.0, 1.0)), scan, camera, image)
+    longest = 6.0 / max(high, wide)
+    figure = new_figure(longest * wide, longest * high)
+    draw_part(figure.subplots(), scan, camera, image)
     return figure
 
 
