@@ -1,0 +1,1 @@
+"""Experiments with vanejax: train, evaluate, and the settings of both."""

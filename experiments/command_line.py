@@ -1,4 +1,4 @@
-"""What every experiment's command line shares: ``--config``, overrides, errors without traceback."""
+"""What every experiment's command line shares: ``--config``, overrides, errors in one line."""
 
 from __future__ import annotations
 
@@ -69,6 +69,9 @@ def run(main: Callable[[], int | None]) -> None:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
 
 
 def resolve_config(argv: list[str]) -> list[str]:

@@ -68,6 +68,8 @@ def train(config: Experiment, workdir: Path) -> None:
     config.check()
     with RunFolder(workdir) as folder:
         part = config.make_part()
+        for note in part.notes:
+            print(f"{part.name}: {note}")
         folder.claim(config, part)
         scans = load_or_scan(config, part, folder.path / "scans.npz")
         state = fit(config, scans, folder)
@@ -89,11 +91,8 @@ def load_or_scan(config: Experiment, part: Part, path: Path) -> ScanSet:
 def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
     """Trains on the training views of ``scans``; the test views are not looked at."""
     settings = config.training
-    model, optimizer, drawing = (
-        config.make_model(),
-        config.make_optimizer(),
-        config.make_drawing(scans),
-    )
+    model, optimizer = config.make_model(), config.make_optimizer()
+    drawing = config.make_drawing(scans)
     bank = make_bank(scans.train, num_reference=config.data.num_reference)
     step = make_train_step(
         model,
@@ -104,64 +103,87 @@ def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
         seed=config.seed,
         average_decay=settings.average_decay,
     )
+    validate = make_validation(config, bank, drawing, scans.radius_mm)
     state = init_state(model, optimizer, bank, drawing, seed=config.seed)
     state = restore_or(folder.checkpoints, state, keep=settings.keep)
-    validate = make_validation(config, bank, drawing, scans.radius_mm)
-    folder.open_log(int(state.step))
-    recent: list[Metrics] = []
-    monitor = Monitor()
 
-    with Checkpoints(folder.checkpoints, keep=settings.keep) as checkpoints, stop_signal() as stop:
-        bar = tqdm(total=settings.steps, initial=int(state.step), unit="step", desc="training")
+    with (
+        Checkpoints(folder.checkpoints, keep=settings.keep) as checkpoints,
+        Log(folder, int(state.step), settings.steps, scans.radius_mm) as log,
+        stop_signal() as stop,
+    ):
         for done in range(int(state.step) + 1, settings.steps + 1):
             state, metrics = step(state, bank)
-            recent.append(metrics)
-            last = done == settings.steps
-            leave = bool(stop)
-            if done % settings.log_every == 0 or last or leave:
-                values = average(recent, scans.radius_mm)
-                monitor.check(done, values)
-                folder.log(done, values)
-                bar.set_postfix_str(
-                    f"loss {values['loss']:.4f}, {values['rotation_error_deg']:.2f} deg, "
-                    f"{values['translation_error_mm']:.2f} mm"
-                )
-                recent = []
-            bar.update()
+            log.add(metrics)
+            leave = bool(stop)  # once: a signal may come between two looks
+            finish = leave or done == settings.steps
             score = None
-            if done % settings.evaluate_every == 0 or last:
-                values = validate(state)
-                folder.log(done, values)
-                score = values["validation_rotation_error_deg"]
-            if done % settings.save_every == 0 or score is not None or leave:
-                monitor.check_variables(done, state)
+            if done % settings.log_every == 0 or finish:
+                log.write(done)
+            if done % settings.evaluate_every == 0 or done == settings.steps:
+                score = log.write_validation(done, validate(state))
+            if done % settings.save_every == 0 or score is not None or finish:
+                log.check_weights(done, state)
                 checkpoints.save(state, score=score)
-            if leave and not last:
-                bar.close()
+            if leave and done < settings.steps:
                 raise Interrupted(stop[0], done)
-        bar.close()
     return state
 
 
-class Monitor:
-    """Watches the loss for NaN and divergence."""
+class Log:
+    """The progress bar, the log on disk, and the watch for divergence; a context manager."""
 
-    def __init__(self) -> None:
-        self._start: float | None = None
+    def __init__(self, folder: RunFolder, step: int, steps: int, radius_mm: float) -> None:
+        self._folder = folder
+        self._radius_mm = radius_mm
+        self._recent: list[Metrics] = []
+        self._first_loss: float | None = None
+        folder.open_log(step)
+        self._bar = tqdm(total=steps, initial=step, unit="step", desc="training")
 
-    def check(self, step: int, values: dict[str, float]) -> None:
-        """Raises TrainingDiverged where the row's loss is not finite or has exploded."""
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def add(self, metrics: Metrics) -> None:
+        """Takes the metrics of one more step, without waiting for the device."""
+        self._recent.append(metrics)
+        self._bar.update()
+
+    def write(self, step: int) -> None:
+        """Logs the mean metrics of the steps since the last row.
+
+        Raises:
+          TrainingDiverged: a mean is not finite, or the loss has exploded.
+        """
+        rows = jax.device_get(self._recent)
+        self._recent = []
+        values = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+        values["translation_error_mm"] = values.pop("translation_error") * self._radius_mm
         bad = [name for name, value in values.items() if not np.isfinite(value)]
         if bad:
             raise TrainingDiverged(f"{', '.join(bad)} not finite at step {step}")
         loss = values["loss"]
-        self._start = self._start or loss
-        if loss > DIVERGED * self._start:
+        self._first_loss = self._first_loss or loss
+        if loss > DIVERGED * self._first_loss:
+            times = loss / self._first_loss
             raise TrainingDiverged(
-                f"the loss at step {step} is {loss:.3g}, {loss / self._start:.0f} times the first"
+                f"the loss at step {step}, {loss:.3g}, is {times:.0f} times the first"
             )
+        self._folder.log(step, values)
+        self._bar.set_postfix_str(
+            f"loss {loss:.4f}, {values['rotation_error_deg']:.2f} deg, "
+            f"{values['translation_error_mm']:.2f} mm"
+        )
 
-    def check_variables(self, step: int, state: TrainState) -> None:
+    def write_validation(self, step: int, values: dict[str, float]) -> float:
+        """Logs validation errors; the score that the best checkpoint is chosen by."""
+        self._folder.log(step, values)
+        return values["validation_rotation_error_deg"]
+
+    def check_weights(self, step: int, state: TrainState) -> None:
         """Raises TrainingDiverged where a weight is not finite: such a state is never saved."""
         if not all_finite((state.variables, state.average)):
             raise TrainingDiverged(f"weights not finite at step {step}")
@@ -219,14 +241,6 @@ def stop_signal() -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def average(rows: list[Metrics], radius_mm: float) -> dict[str, float]:
-    """Means of metrics over steps as plain numbers; the translation error in mm."""
-    fetched = jax.device_get(rows)
-    values = {name: float(np.mean([row[name] for row in fetched])) for name in fetched[0]}
-    values["translation_error_mm"] = values.pop("translation_error") * radius_mm
-    return values
 
 
 def main(config: Experiment, workdir: Path) -> int:

@@ -1,0 +1,1 @@
+"""Virtual scans of guide vanes, learned registration in JAX, and a pose to trust."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import os
 import zipfile
 from collections.abc import Mapping
@@ -230,11 +231,8 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) ->
             raise InputError(f"{path}: {entry.filename} has array format {version}, expected 1.0")
         shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
         data = file.read()
-    if (
-        dtype.hasobject
-        or fortran
-        or len(data) != int(np.prod(shape, dtype=object)) * dtype.itemsize
-    ):
+    announced = math.prod(shape) * dtype.itemsize
+    if dtype.hasobject or fortran or len(data) != announced:
         raise InputError(f"{path}: {entry.filename} does not hold the array that it announces")
     return np.frombuffer(data, dtype).reshape(shape)
 
@@ -249,7 +247,8 @@ def _read_header(raw: np.ndarray | None, path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: not a scan set of vanejax")
     if header["version"] != VERSION:
         raise InputError(
-            f"{path}: scan set version {header['version']}, this program reads {VERSION}; scan again"
+            f"{path}: scan set version {header['version']}, this program reads {VERSION}; "
+            "delete it and scan again"
         )
     return header
 

@@ -8,5 +8,5 @@ def get_config() -> Experiment:
     return Experiment(
         name="vane",
         loss=LossSettings(matching=0.02),
-        training=TrainingSettings(steps=5000, learning_rate=2e-3),
+        training=TrainingSettings(steps=4000, learning_rate=2e-3),
     )

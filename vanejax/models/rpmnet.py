@@ -122,6 +122,7 @@ class RpmNet(nn.Module):
     feature_width: int = 96
 
     def setup(self) -> None:
+        """Names the two networks."""
         self.feature_net = FeatureNet(self.feature_width)
         self.annealing_net = AnnealingNet()
 
