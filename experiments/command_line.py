@@ -102,13 +102,26 @@ def resolve_config(argv: list[str]) -> list[str]:
 
 def _parse(argv: list[str]) -> list[str]:
     """Absl's parser, with overrides checked first so that a typo lists the right names."""
-    overrides = [m.group(1) for a in argv[1:] if (m := _OVERRIDE.match(a))]
-    for path in overrides:
-        _check_field(path)
+    for argument in argv[1:]:
+        if match := _OVERRIDE.match(argument):
+            _check_field(match.group(1))
     try:
-        return app.parse_flags_with_usage(argv)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"a config override is wrong: {error}") from error
+        return flags.FLAGS(argv)
+    except flags.IllegalFlagValueError as error:
+        match = _OVERRIDE.search(str(error))
+        wanted = f"; it takes {_kind(match.group(1))}" if match else ""
+        raise InputError(f"{error}{wanted}") from error
+    except (flags.Error, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{error}; see --help") from error
+
+
+def _kind(path: str) -> str:
+    """What a field holds, such as "an int, for example 32"."""
+    value: Any = Experiment()
+    for name in path.split("."):
+        value = getattr(value, name)
+    kind = type(value).__name__
+    return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}, for example {value!r}"
 
 
 def _check_field(path: str) -> None:

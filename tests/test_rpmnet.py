@@ -45,8 +45,8 @@ def state_dict(seed: int = 0) -> dict[str, np.ndarray]:
                     gain = 1 + 0.2 * rng.normal(size=out)
                     state[f"{norm}.weight"] = gain * np.where(rng.uniform(size=out) < 0.2, -1, 1)
                     state[f"{norm}.bias"] = rng.normal(size=out, scale=0.3)
-    # random features are much alike: a large beta tells them apart
-    state["weights_net.postpool.6.bias"] = np.array([300.0, 0.5])
+    # random features lie 0.003 to 0.2 apart: beta must tell them apart, alpha lie in their midst
+    state["weights_net.postpool.6.bias"] = np.array([300.0, -4.0])
     # as the importer keeps them: f32
     return {name: value.astype(np.float32) for name, value in state.items()}
 
@@ -205,10 +205,8 @@ def test_it_is_the_slow_twin_on_other_inputs_and_another_k():
     assert_matches(found, slow_answer(), source.mask, target.mask)
     for match in found:
         np.testing.assert_array_equal(match.weights[~source.mask], 0)
-    # the problem is one in which something happens
-    weights = slow_answer()[0]["weights"]
-    assert weights.min() > 0.01
-    assert np.ptp(weights) > 0.01
+    # the problem is one in which something happens: some points match, some go to the slack
+    assert np.ptp(slow_answer()[0]["weights"]) > 0.5
     gap = found[1].target_from_source.as_matrix() - found[0].target_from_source.as_matrix()
     assert np.abs(gap).max() > 1e-3
 
@@ -392,6 +390,7 @@ def test_import_from_a_file(tmp_path):
 
 BIAS = "feat_extractor.prepool.3.bias"
 KERNEL = "feat_extractor.prepool.3.weight"
+FIRST = "feat_extractor.prepool.0.weight"
 
 
 @pytest.mark.parametrize(
@@ -400,6 +399,7 @@ KERNEL = "feat_extractor.prepool.3.weight"
         ({BIAS: None}, BIAS),
         ({"weights_net.postpool.4.weight": None}, "weights_net.postpool.4.weight"),
         ({"classifier.weight": np.zeros(3)}, "classifier.weight"),
+        ({FIRST: np.zeros((10, 96, 1, 1))}, FIRST),  # transposed
         ({KERNEL: np.zeros((96, 10, 1, 1))}, KERNEL),
         ({KERNEL: np.zeros((96, 96, 3, 3))}, KERNEL),
         ({KERNEL: np.zeros(96)}, KERNEL),

@@ -151,7 +151,8 @@ def init_state(
     @jax.jit
     def init(key: jax.Array) -> Variables:
         # Only the shapes of a pair matter here: inside the jit nothing of it is computed.
-        pairs = draw_pairs(key, bank, jnp.zeros((1,), jnp.int32), drawing)
+        draw_key = jax.random.fold_in(key, 1)
+        pairs = draw_pairs(draw_key, bank, jnp.zeros((1,), jnp.int32), drawing)
         source = jax.tree.map(lambda leaf: leaf[0], pairs.source)
         return model.init(key, source, pairs.target, RigidTransform.identity(), 1)
 

@@ -153,23 +153,27 @@ def _masked_product(chunk: tuple[jax.Array, jax.Array], kernel: jax.Array) -> ja
 
 
 def _dense_max_forward(x: jax.Array, kernel: jax.Array, mask: jax.Array) -> tuple:
-    top = _chunked_dense_max(x, kernel, mask)
-    return top, (x, kernel, mask, top)
+    return _chunked_dense_max(x, kernel, mask), (x, kernel, mask)
 
 
 def _dense_max_backward(saved: tuple, gradient: jax.Array) -> tuple:
-    """Recomputes each chunk's product: cheaper than reading it back from memory."""
-    x, kernel, mask, top = saved
+    """Recomputes each chunk's product: cheaper than reading it back from memory.
+
+    The maxima are those of this product, not of the forward one: another kernel may round
+    differently, and then no row would equal its maximum.
+    """
+    x, kernel, mask = saved
 
     def body(d_kernel: jax.Array, chunk: tuple) -> tuple[jax.Array, jax.Array]:
-        x, mask, top, gradient = chunk
-        winner = (_masked_product((x, mask), kernel) == top[..., None, :]) & mask[..., None]
+        x, mask, gradient = chunk
+        product = _masked_product((x, mask), kernel)
+        winner = (product == jnp.max(product, -2, keepdims=True)) & mask[..., None]
         count = jnp.maximum(jnp.sum(winner, -2, dtype=x.dtype), 1.0)
         d_product = jnp.where(winner, (gradient / count)[..., None, :], 0.0)
         d_kernel += jnp.einsum("pkc,pkd->cd", x, d_product)
         return d_kernel, d_product @ kernel.T
 
-    d_kernel, d_x = jax.lax.scan(body, jnp.zeros_like(kernel), (x, mask, top, gradient))
+    d_kernel, d_x = jax.lax.scan(body, jnp.zeros_like(kernel), (x, mask, gradient))
     return d_x, d_kernel, None
 
 
