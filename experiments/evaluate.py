@@ -2,7 +2,10 @@
 
 python -m experiments.evaluate --config vane.py [--workdir runs/vane] [--config.FIELD=VALUE ...]
 
-Needs what ``experiments.train`` left in the work folder: the scans and a checkpoint.
+Needs what ``experiments.train`` left in the work folder: the scans and a checkpoint. What limits
+the network shows by changing what it is tested with, results kept apart by ``--out``:
+``--config.data.noise=0``, ``--config.data.num_reference=2048``, ``--config.model.test_iterations=2``,
+and another ``--config.seed`` for other points, noise and poses.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import functools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +42,7 @@ def evaluate(
     folder: Path,
     *,
     part: Part | None = None,
+    log: Sequence[Mapping[str, float]] = (),
     progress: bool = True,
 ) -> dict[str, Any]:
     """Registers the test views with RPM-Net, from the identity, and reports.
@@ -48,6 +53,7 @@ def evaluate(
       variables: trained weights.
       folder: receives evaluation.json and pictures.
       part: where given, pictures that need the CAD part are drawn too.
+      log: rows of the training log; where given, the training curves are drawn too.
       progress: whether to show a progress bar.
 
     Returns:
@@ -82,7 +88,7 @@ def evaluate(
     report = plain(report | summarize(results, test))
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "evaluation.json", report)
-    pictures.draw(results, test, hardest_views(test), read_log(folder), folder)
+    pictures.draw(results, test, hardest_views(test), log, folder)
     if part is not None:
         pictures.draw_with_part(results, test, hardest_views(test), part, config, folder)
     print(table(report))
@@ -122,20 +128,26 @@ def load_variables(
         return checkpoints.restore(like, step=step).average
 
 
-def main(config: Experiment, workdir: Path, which: str) -> None:
-    """Evaluates the trained network of a work folder."""
+def main(config: Experiment, workdir: Path, out: Path, which: str) -> None:
+    """Evaluates the trained network of a work folder; the results go to ``out``."""
     config.check()
     part = config.make_part()
     camera, viewpoints = config.make_camera(), config.make_viewpoints(part)
     expected = describe_source(part, camera, viewpoints, config.data.voxel_mm)
     scans = load_scan_set(workdir / "scans.npz", expected=expected)
-    evaluate(config, scans, load_variables(config, scans, workdir, which=which), workdir, part=part)
+    variables = load_variables(config, scans, workdir, which=which)
+    evaluate(config, scans, variables, out, part=part, log=read_log(workdir))
 
 
 if __name__ == "__main__":
     CONFIG = command_line.define_config()
     WORKDIR = command_line.define_workdir()
     CHECKPOINT = flags.DEFINE_enum("checkpoint", "latest", ["latest", "best"], "which weights")
-    command_line.run(
-        lambda: main(CONFIG.value, command_line.workdir(WORKDIR, CONFIG), CHECKPOINT.value)
-    )
+    OUT = flags.DEFINE_string("out", None, "folder for the results; the work folder if not given")
+
+    def run() -> None:
+        """The command."""
+        workdir = command_line.workdir(WORKDIR, CONFIG)
+        main(CONFIG.value, workdir, Path(OUT.value or workdir), CHECKPOINT.value)
+
+    command_line.run(run)

@@ -22,7 +22,7 @@ from tqdm import tqdm
 from experiments import command_line
 from experiments.evaluate import evaluate
 from experiments.experiment import Experiment
-from experiments.run_folder import RunFolder
+from experiments.run_folder import RunFolder, read_log
 from vanejax.checkpoint import Checkpoints, all_finite, restore_or
 from vanejax.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
 from vanejax.pairs import Drawing, ScanBank, draw_pairs, make_bank
@@ -73,7 +73,7 @@ def train(config: Experiment, workdir: Path) -> None:
         folder.claim(config, part)
         scans = load_or_scan(config, part, folder.path / "scans.npz")
         state = fit(config, scans, folder)
-        evaluate(config, scans, state.average, workdir, part=part)
+        evaluate(config, scans, state.average, workdir, part=part, log=read_log(workdir))
 
 
 def load_or_scan(config: Experiment, part: Part, path: Path) -> ScanSet:

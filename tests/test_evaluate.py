@@ -158,8 +158,8 @@ def test_evaluate_writes_json_and_pictures(
         key, source, source, RigidTransform.identity(), 1
     )
     rows = [{"step": step, "loss": 1 / step, "rotation_error_deg": 2.0} for step in (1, 2, 3)]
-    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    report = evaluate(config, scans, variables, tmp_path, part=config.make_part(), progress=False)
+    part = config.make_part()
+    report = evaluate(config, scans, variables, tmp_path, part=part, log=rows, progress=False)
 
     def refuse(constant: str) -> float:
         raise ValueError(constant)
@@ -173,7 +173,6 @@ def test_evaluate_writes_json_and_pictures(
     pictures = ("overlays", "error_map", "axis_errors", "training_curves", "view_and_shadow")
     assert {path.name for path in tmp_path.iterdir()} == {
         "evaluation.json",
-        "metrics.jsonl",
         "overview.png",
         *(f"{name}.png" for name in pictures),
     }
