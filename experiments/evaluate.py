@@ -4,8 +4,8 @@ python -m experiments.evaluate --config vane.py [--workdir runs/vane] [--config.
 
 Needs what ``experiments.train`` left in the work folder: the scans and a checkpoint. What limits
 the network shows by changing what it is tested with, results kept apart by ``--out``:
-``--config.data.noise=0``, ``--config.data.num_reference=2048``, ``--config.model.test_iterations=2``,
-and another ``--config.seed`` for other points, noise and poses.
+``--config.data.noise=0``, ``--config.data.num_reference=2048``,
+``--config.model.test_iterations=2``, and another ``--config.seed`` for other points, noise, poses.
 """
 
 from __future__ import annotations
