@@ -223,7 +223,11 @@ def test_the_schedule_warms_up_and_decays():
 
 def test_a_warm_up_longer_than_the_run_is_no_error():
     optimizer = make_optimizer(learning_rate=0.1, steps=3, warmup_steps=10, clip_norm=1.0)
-    optimizer.init(jnp.zeros(2))
+    state = optimizer.init(jnp.zeros(2))
+    for _ in range(3):  # the whole run is warm-up: steps grow and stay finite
+        update, state = optimizer.update(jnp.ones(2), state, jnp.zeros(2))
+    assert (update < 0).all()
+    assert jnp.isfinite(update).all()
 
 
 def test_gradients_are_clipped_by_their_global_norm():
