@@ -179,7 +179,13 @@ class Log:
         )
 
     def write_validation(self, step: int, values: dict[str, float]) -> float:
-        """Logs validation errors; the score that the best checkpoint is chosen by."""
+        """Logs validation errors; the score that the best checkpoint is chosen by.
+
+        Raises:
+          TrainingDiverged: an error is not finite.
+        """
+        if not all(np.isfinite(value) for value in values.values()):
+            raise TrainingDiverged(f"the validation at step {step} is not finite")
         self._folder.log(step, values)
         return values["validation_rotation_error_deg"]
 

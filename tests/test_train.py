@@ -45,20 +45,20 @@ def wait_for_step(workdir: Path, process: subprocess.Popen, step: int) -> None:
     raise AssertionError(f"step {step} was not reached in 300 s")
 
 
-def final_arrays(workdir: Path) -> dict[str, np.ndarray]:
-    """Every array of the last state, read without the training code."""
+def arrays_of(workdir: Path, step: int) -> dict[str, np.ndarray]:
+    """Every array of a saved state, read without the training code."""
     import orbax.checkpoint as ocp
 
     with ocp.CheckpointManager((workdir / "checkpoints").absolute()) as manager:
-        assert manager.latest_step() == STEPS
-        tree = manager.restore(STEPS, args=ocp.args.StandardRestore())
+        assert step in manager.all_steps()
+        tree = manager.restore(step, args=ocp.args.StandardRestore())
     import jax
 
     return {jax.tree_util.keystr(k): np.asarray(v) for k, v in jax.tree.leaves_with_path(tree)}
 
 
 def assert_bit_equal(left: Path, right: Path) -> None:
-    one, other = final_arrays(left), final_arrays(right)
+    one, other = arrays_of(left, STEPS), arrays_of(right, STEPS)
     assert one.keys() == other.keys()
     assert len(one) > 100  # parameters, their average, two moments: nothing was left out
     for name, value in one.items():
@@ -141,6 +141,12 @@ def test_divergence_stops_and_keeps_the_last_good_checkpoint(tmp_path, environme
     assert code == 1
     assert "training stopped" in text
     assert "last good checkpoint is kept" in text
+    kept = list((workdir / "checkpoints").glob("[0-9]*"))
+    assert kept
+    for path in kept:
+        assert all(
+            np.isfinite(value).all() for value in arrays_of(workdir, int(path.name)).values()
+        )
     assert "Traceback" not in text
 
 
