@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = [
     # the ground, for both sides
     "errors",
+    "whole_file",
     "rigid",
     "pointcloud",
     # host: parts
@@ -35,6 +36,22 @@ LAYERS = [
     "dataset",
     "inert_pickle",
     "torch_weights",
+    "sensor_place",
+    "measured_scan",
+    "point_records",
+    "pcd_file",
+    "ply_file",
+    "point_file",
+    "scan_file",
+    "pose_result",
+    "pose_file",
+    # host: fine registration
+    "surface",
+    "residuals",
+    "refine",
+    "verification",
+    "verdict",
+    "pose_search",
     # JAX: registration
     "features",
     "matching",
@@ -47,15 +64,39 @@ LAYERS = [
     "metrics",
     "training",
     "checkpoint",
+    # one scan, one part, one pose
+    "normals",
+    "model_file",
+    "model_export",
+    "inspection",
+    "matched_poses",
+    "locate",
     # pictures
     "plotting.canvas",
     "plotting.shading",
     "plotting.clouds",
     "plotting.charts",
     "plotting.overview",
+    "plotting.scene",
+    "plotting.deviation",
     "plotting",
+    "report.wording",
+    "report.pictures",
+    "report.viewer",
+    "report.page",
+    "report",
+    # the command line
+    "compilation_cache",
+    "commands.workpiece",
+    "commands.pose_summary",
+    "commands.register",
+    "commands.scan",
+    "commands.inspect",
+    "commands.export",
+    "cli",
+    "__main__",
 ]
-HOST = LAYERS[: LAYERS.index("torch_weights") + 1]
+HOST = LAYERS[: LAYERS.index("pose_search") + 1]
 
 
 def modules(package: str = "vanejax") -> dict[str, Path]:
@@ -67,6 +108,8 @@ def modules(package: str = "vanejax") -> dict[str, Path]:
             if all(isinstance(node, ast.Expr) for node in ast.parse(path.read_text()).body):
                 continue
             parts = parts[:-1]
+        if not parts:
+            continue  # the package's own face, which loads what it offers when asked
         found[".".join(parts)] = path
     return found
 

@@ -14,6 +14,7 @@ from vanejax.plotting.clouds import (
     view_and_shadow,
     view_name,
 )
+from vanejax.plotting.deviation import deviation_map, overlay_before_after, residual_histogram
 from vanejax.plotting.overview import overview_picture
 from vanejax.plotting.shading import part_picture, shade
 
@@ -23,10 +24,13 @@ __all__ = [
     "AxisErrors",
     "Overlay",
     "axis_errors",
+    "deviation_map",
     "error_map",
+    "overlay_before_after",
     "overview_picture",
     "part_picture",
     "registration_overlays",
+    "residual_histogram",
     "save_figure",
     "shade",
     "training_curves",

@@ -1,0 +1,157 @@
+"""The simulated sensors against their own settings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from experiments import depth_camera
+from experiments.challenge_parts import challenge_parts
+from experiments.depth_camera import KINDS, measure, random_pose, sensor
+from vanejax.errors import InputError
+from vanejax.rigid import RigidTransform
+from vanejax.scanner import Scanner
+
+
+@pytest.fixture(scope="module")
+def box():
+    return challenge_parts(["box"])["box"].part
+
+
+@pytest.fixture(scope="module")
+def scanner(box):
+    return Scanner(box)
+
+
+@pytest.fixture(scope="module")
+def frontal(box):
+    """The box's largest face, 80 x 60 mm, squarely at 230 mm depth."""
+    return RigidTransform(np.eye(3), np.array([0.0, 0.0, -250.0]) - box.center)
+
+
+def distances_mm(box, pose: RigidTransform, points: np.ndarray) -> np.ndarray:
+    """Exact distances [N] to the box."""
+    aside = np.abs(pose.inverse().apply(points) - box.center) - np.array([40.0, 30, 20])
+    return np.linalg.norm(np.maximum(aside, 0), axis=1) + np.minimum(aside.max(axis=1), 0)
+
+
+def test_structured_light_has_the_noise_that_it_says(box, scanner, frontal):
+    points = measure(box, scanner, frontal, kind="structured_light", seed=1)
+    assert points.dtype == np.float64
+    # rays to the corners meet the face at 12 deg: the cosine changes noise by 2 %
+    assert len(points) > 20_000
+    assert np.std(points[:, 2]) == pytest.approx(0.05, rel=0.03)
+    assert np.mean(points[:, 2]) == pytest.approx(-230, abs=0.002)  # 5 sigma of the mean
+
+
+def test_lateral_noise_is_across_the_ray_only(box, scanner, frontal):
+    camera = sensor("structured_light").camera
+    points = measure(box, scanner, frontal, kind="structured_light", seed=1)
+    pixel = camera.project(points)
+    off = (pixel - np.floor(pixel) - 0.5) * 230 / np.array([camera.fx, camera.fy])
+    np.testing.assert_allclose(np.std(off, axis=0), 0.02, rtol=0.03)
+
+
+def test_steep_faces_are_not_measured(box, scanner):
+    # the largest face is seen at some 80 deg, a side squarely
+    turn = np.radians(82.0)
+    rotation = np.array(
+        [[1, 0, 0], [0, np.cos(turn), -np.sin(turn)], [0, np.sin(turn), np.cos(turn)]]
+    )
+    pose = RigidTransform(rotation, np.array([0.0, 0, -300]) - rotation @ box.center)
+    ideal = scanner.scan(sensor("structured_light").camera, pose)
+    points = measure(box, scanner, pose, kind="structured_light", seed=0)
+    assert np.count_nonzero(ideal.incidence_deg > 75) > 1000
+    assert len(points) == np.count_nonzero(ideal.incidence_deg <= 75)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_depth_camera_is_like_the_real_one(box, scanner, seed):
+    pose = random_pose(np.random.default_rng(seed), box, 250.0)
+    points = measure(box, scanner, pose, kind="depth_camera", seed=seed)
+    assert 2000 <= len(points) <= 8000
+    np.testing.assert_allclose(points[:, 2], np.round(points[:, 2]), atol=1e-9)
+    distance = distances_mm(box, pose, points)
+    inliers = np.abs(distance) < 4
+    # bias of 0.5 to 1.5 mm and steps of 1 mm, seen at a slant
+    assert 0.3 < np.sqrt(np.mean(distance[inliers] ** 2)) < 2.2
+    assert 0 < np.mean(distance > 2) < 0.15
+    # the error is no white noise: neighbours' errors agree, their mean over a tenth does not vanish
+    thirds = [np.abs(np.mean(d)) for d in np.array_split(distance[inliers], 10)]
+    assert max(thirds) > 0.2
+
+
+def test_the_depth_camera_errs_more_from_farther(box, scanner):
+    rms = {}
+    for depth in (200.0, 400.0):
+        pose = RigidTransform(np.eye(3), np.array([0.0, 0.0, -depth - 20]) - box.center)
+        errors = [
+            measure(box, scanner, pose, kind="depth_camera", seed=s)[:, 2] + depth
+            for s in range(12)
+        ]
+        errors = np.concatenate(errors)
+        rms[depth] = np.sqrt(np.mean(errors[np.abs(errors) < 15] ** 2))
+    # 4 by theory; the steps of 1 mm and flying pixels, the same at both, take from it
+    assert 1.8 < rms[400.0] / rms[200.0] < 4.5
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_clutter_is_a_tenth_to_a_fifth_and_not_of_the_part(box, scanner, seed):
+    pose = random_pose(np.random.default_rng([seed, 5]), box, 300.0)
+    points = measure(box, scanner, pose, kind="clutter", seed=seed)
+    foreign = np.abs(distances_mm(box, pose, points)) > 0.4  # 8 times the noise
+    # a table's strip along the edge on which the part lies is nearer than that
+    assert 0.07 < np.mean(foreign) < 0.21
+    assert np.linalg.norm(points - pose.apply(box.center[None]), axis=1).max() < 4 * box.radius
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_seed_gives_the_same_points_and_another_does_not(box, scanner, frontal, kind):
+    once, again = (measure(box, scanner, frontal, kind=kind, seed=3) for _ in range(2))
+    other = measure(box, scanner, frontal, kind=kind, seed=4)
+    np.testing.assert_array_equal(once, again)
+    assert other.shape != once.shape or np.any(other != once)
+
+
+def test_an_unknown_kind_is_refused(box, scanner, frontal):
+    with pytest.raises(InputError, match="no sensor kind"):
+        measure(box, scanner, frontal, kind="lidar", seed=0)
+
+
+def test_random_poses_are_uniform_and_at_their_distance(box):
+    rng = np.random.default_rng(0)
+    poses = [random_pose(rng, box, 300.0) for _ in range(2000)]
+    rotations = np.stack([p.rotation for p in poses])
+    # under the uniform law every entry has mean 0 and variance 1 / 3; 5 sigma
+    assert np.abs(rotations.mean(axis=0)).max() < 5 * np.sqrt(1 / 3 / 2000)
+    assert np.abs((rotations**2).mean(axis=0) - 1 / 3).max() < 5 * np.sqrt(4 / 45 / 2000)
+    centers = np.stack([p.apply(box.center[None])[0] for p in poses])
+    np.testing.assert_allclose(centers[:, 2], -300)
+    assert np.abs(centers[:, :2]).max() <= 9
+    with pytest.raises(InputError, match="not outside"):
+        random_pose(rng, box, 20.0)
+
+
+def test_the_bias_field_is_smooth_and_of_unit_size():
+    rng = np.random.default_rng(0)
+    fields = np.stack([depth_camera._smooth((80, 100), 20.0, rng) for _ in range(200)])
+    assert np.std(fields) == pytest.approx(1, rel=0.15)  # splines between the nodes lose some
+    assert np.std(np.diff(fields, axis=1)) < 0.15
+
+
+def test_only_pixels_beside_a_jump_fly_and_never_beyond_it():
+    depth = np.full((40, 60), 200.0)
+    depth[:, 30:] = 209.0
+    settings = sensor("depth_camera")
+    flying = depth_camera._flying(settings, depth, np.random.default_rng(0))
+    assert 10 < np.count_nonzero(flying[:, 29]) < 30  # half of 40
+    assert np.all(np.delete(flying, 29, axis=1) == 0)
+    assert flying.max() < 9
+
+
+def test_a_crop_takes_its_share_from_one_side():
+    depth = np.full((50, 50), 200.0)
+    depth_camera._crop(depth, 0.1, np.random.default_rng(0))
+    lost = np.argwhere(np.isnan(depth))
+    assert len(lost) == 250
+    assert np.linalg.norm(lost.mean(axis=0) - 24.5) > 15

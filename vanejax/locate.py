@@ -1,0 +1,331 @@
+"""One scan, one CAD model, one pose to trust: search, challenge, fine registration, verdict."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from vanejax.errors import InputError
+from vanejax.matched_poses import icosahedral_rotations, match_poses
+from vanejax.measured_scan import MeasuredScan, clean_scan
+from vanejax.model_file import TrainedMatcher, load_model
+from vanejax.part import Part, load_part
+from vanejax.pose_result import Alternative, PoseResult, Verdict
+from vanejax.pose_search import (
+    Candidates,
+    challenge,
+    concatenate,
+    distances,
+    distinct,
+    is_same,
+    noise_level,
+    search,
+    select,
+    settle,
+    starts,
+)
+from vanejax.refine import descend, refine, subset, uncertainty
+from vanejax.residuals import MeasurementModel, RayCasting, SurfaceMatching
+from vanejax.rigid import RigidTransform
+from vanejax.scan_file import load_scan
+from vanejax.scanner import Scanner
+from vanejax.surface import Surface
+from vanejax.verdict import Limits, Rival, judge
+from vanejax.verification import View, evidence, verify
+
+RIVALS = 8  # poses beside the best that are followed to their end and compared with it
+RIVAL_POINTS = 8_000
+VERIFIED_POINTS = 100_000
+# of the part's radius: a casting is no truer to its model than the first, and what is farther off
+# than the second is not on the part
+LEAST_TOLERANCE, MOST_TOLERANCE = 0.001, 0.12
+REACH = 0.3  # of the part's radius: how far a surface partner is sought where no ray is known
+# one search more with three times the starts where the first ends in a rejection
+STARTS = (400, 1200)
+# a guess is good to this; a pose farther away that fits as well is no reason to doubt it
+GUESS_DEG, GUESS_SHIFT = 30.0, 0.3
+MATCH_ITERATIONS = 2  # of RPM-Net from each of 60 rotations; ray casting does the rest
+
+
+def register(
+    scan: MeasuredScan | np.ndarray | str | os.PathLike[str],
+    part: Part | str | os.PathLike[str],
+    *,
+    units_scan: str = "auto",
+    units_cad: str = "mm",
+    sensor_origin: str | np.ndarray = "auto",
+    init: RigidTransform | None = None,
+    weights: TrainedMatcher | str | os.PathLike[str] | None = None,
+    limits: Limits | None = None,
+    seed: int = 0,
+) -> PoseResult:
+    """Finds where a part is in a scan, how sure that is, and whether to trust it.
+
+    Without a guess the pose is searched among all rotations: by a trained RPM-Net where
+    ``weights`` are given, else, and where that is not accepted, by ray casting. What is found is
+    challenged by the poses at which the part may look alike, refined on all points, verified, and
+    judged.
+
+    Args:
+      scan: a file (PLY, PCD, XYZ, CSV, NPZ), points [N, 3] in mm, or a `MeasuredScan`.
+      part: a CAD file or a `Part`.
+      units_scan: of a scan file: mm, cm, m, in, ...; "auto" takes mm, or m where only that fits.
+      units_cad: of a CAD file.
+      sensor_origin: [3] mm in the scan's frame; "auto" takes the scan's origin where that can be
+        the sensor's place; "unknown" for merged or moved clouds: then nothing is known of rays, and
+        fewer wrong poses can be told from right ones. Of no use with a `MeasuredScan`, which has
+        its own.
+      init: rough part_from_camera. Poses far from it that fit as well are then no ambiguity.
+      weights: what `vanejax export` wrote for this part, or its path.
+      limits: of the verdict.
+      seed: of all random subsets: same seed, same result.
+
+    Raises:
+      InputError: a file or a value that makes no sense; a part that the weights do not know.
+    """
+    seconds: dict[str, float] = {}
+    with _timed(seconds, "read"):
+        part = part if isinstance(part, Part) else load_part(part, units=units_cad)
+        if isinstance(weights, str | os.PathLike):
+            weights = load_model(weights)
+        if weights is not None:
+            weights.check_part(part)
+        init = None if init is None else _checked(init)
+        assumed = isinstance(sensor_origin, str) and sensor_origin == "auto"
+        if isinstance(scan, MeasuredScan):
+            assumed = False
+        elif isinstance(scan, np.ndarray):
+            scan = clean_scan(scan, sensor_origin=sensor_origin)
+        else:
+            scan = load_scan(
+                scan, units=units_scan, part_extent_mm=part.extent_mm, sensor_origin=sensor_origin
+            )
+    result = _locate(scan, part, init, weights, limits, seed, seconds)
+    if assumed and scan.sensor_origin is not None and result.verdict.status == "rejected":
+        # perhaps the cloud was moved after it was taken: then the rays are wrong, not the pose
+        merged = dataclasses.replace(
+            scan,
+            sensor_origin=None,
+            notes=(
+                *scan.notes,
+                "seen from the scan's origin the part does not fit, from anywhere it does: the "
+                "sensor's place is taken as unknown",
+            ),
+        )
+        other = _locate(merged, part, init, weights, limits, seed, seconds)
+        if other.verdict.status == "accepted":
+            return other
+    return result
+
+
+def _locate(
+    scan: MeasuredScan,
+    part: Part,
+    init: RigidTransform | None,
+    weights: TrainedMatcher | None,
+    limits: Limits | None,
+    seed: int,
+    seconds: dict[str, float],
+) -> PoseResult:
+    """Tries sources of poses, cheapest first, until one is not rejected."""
+    with _timed(seconds, "set up"):
+        model = _model(scan, part)
+    results = []
+    for found in _sources(model, scan, init, weights, seed, seconds):
+        result = _finish(model, scan, found, init, limits, seed, seconds)
+        if result.verdict.status == "accepted" or (
+            result.verdict.status == "ambiguous" and result.alternatives
+        ):
+            return result
+        results.append(result)
+    if init is not None:
+        return results[0]
+    return max(results, key=lambda result: result.verification.score)
+
+
+def _model(scan: MeasuredScan, part: Part) -> MeasurementModel:
+    """Rays where they are known, else the surface."""
+    surface = Surface(part)
+    if scan.sensor_origin is None:
+        return SurfaceMatching(surface, reach_mm=REACH * part.radius)
+    return RayCasting(Scanner(part), surface, scan.sensor_origin)
+
+
+def _sources(
+    model: MeasurementModel,
+    scan: MeasuredScan,
+    init: RigidTransform | None,
+    weights: TrainedMatcher | None,
+    seed: int,
+    seconds: dict[str, float],
+) -> Iterator[Candidates]:
+    """Candidates from the guess; else from RPM-Net; else from more and more rotations."""
+    points = scan.points
+    if init is not None:
+        guesses = _batch(init)
+        if weights is not None:
+            with _timed(seconds, "match"):
+                matched = match_poses(
+                    weights, scan, guesses, iterations=weights.iterations, seed=seed
+                )
+            guesses = concatenate(guesses, matched)
+        with _timed(seconds, "search"):
+            found = settle(model, points, guesses, seed=seed)
+        yield found
+        return
+    if weights is not None:
+        with _timed(seconds, "match"):
+            some = points[subset(points, RIVAL_POINTS, seed)]
+            guesses = starts(model, some, icosahedral_rotations())
+            matched = match_poses(weights, scan, guesses, iterations=MATCH_ITERATIONS, seed=seed)
+        with _timed(seconds, "search"):
+            found = search(model, points, extra=matched, count=0, seed=seed)
+        yield found
+    for attempt, count in enumerate(STARTS):
+        with _timed(seconds, "search"):
+            found = search(model, points, count=count, seed=seed + attempt)
+        yield found
+
+
+def _finish(
+    model: MeasurementModel,
+    scan: MeasuredScan,
+    found: Candidates,
+    init: RigidTransform | None,
+    limits: Limits | None,
+    seed: int,
+    seconds: dict[str, float],
+) -> PoseResult:
+    """Challenges, compares, refines, verifies and judges the best of the candidates."""
+    part, points, limits = model.part, scan.points, limits or Limits()
+    with _timed(seconds, "challenge"):
+        pool = challenge(model, points, found, seed=seed)
+        some = points[subset(points, RIVAL_POINTS, seed + 2)]
+        poses, _ = descend(
+            model,
+            select(pool.part_from_camera, slice(0, 1 + RIVALS)),
+            some,
+            iterations=10,
+            feet="samples",
+            floor_mm=LEAST_TOLERANCE * part.radius,
+            settled_deg=0.01,
+        )
+        view = _view(scan, some)
+        level = float(_tolerance(model, poses, some).min())
+        total = evidence(model, poses, some, tolerance_mm=level, view=view).total
+        if init is not None:  # the pose near the guess is the one to judge
+            total[is_same(*distances(poses, found.pose(0), part), part)] += 10
+        order = np.argsort(-total, kind="stable")
+        poses = select(poses, order[distinct(select(poses, order), part, len(order))])
+    with _timed(seconds, "refine"):
+        refinement = refine(model, points, select(poses, 0), seed=seed)
+        pose = refinement.part_from_camera
+    with _timed(seconds, "verify"):
+        poses = concatenate(_batch(pose), select(poses, slice(1, None)))
+        tolerance = float(_tolerance(model, _batch(pose), some)[0])
+        said = evidence(model, poses, some, tolerance_mm=tolerance, view=view)
+        checked = subset(points, VERIFIED_POINTS, seed + 3)
+        verification = verify(
+            model, pose, points, checked, tolerance_mm=tolerance, view=_view(scan, points[checked])
+        )
+    sure = uncertainty(refinement, part.center)
+    turn, shift = distances(poses, pose, part)
+    rivals = [
+        Rival(said.preference(0, k), float(turn[k]), float(shift[k]), select(poses, k))
+        for k in np.flatnonzero(~is_same(turn, shift, part))
+    ]
+    notes = [*scan.notes, *part.notes]
+    if init is not None:
+        rivals = _near_guess(rivals, init, part, limits, notes)
+    verdict = judge(refinement, verification, sure, rivals, radius_mm=part.radius, limits=limits)
+    near = sorted(
+        (r for r in rivals if r.preference < limits.least_preference), key=lambda r: r.preference
+    )
+    return PoseResult(
+        part_from_camera=pose,
+        verdict=verdict,
+        refinement=refinement,
+        uncertainty=sure,
+        verification=verification,
+        alternatives=tuple(_alternative(model, rival, some, tolerance) for rival in near)
+        if verdict.status == "ambiguous"
+        else (),
+        before=found.pose(0) if init is None else init,
+        sensor_origin=scan.sensor_origin,
+        notes=tuple(notes),
+        seconds=seconds,
+    )
+
+
+def _near_guess(
+    rivals: list[Rival], init: RigidTransform, part: Part, limits: Limits, notes: list[str]
+) -> list[Rival]:
+    """Without those that a rough guess rules out: far from it and no better than the pose near it."""
+    kept = []
+    for rival in rivals:
+        turn, shift = distances(_batch(rival.part_from_camera), init, part)
+        far = turn[0] > GUESS_DEG or shift[0] > GUESS_SHIFT * part.radius
+        if far and rival.preference > -limits.least_preference:
+            if rival.preference < limits.least_preference:
+                notes.append(
+                    f"a pose turned by {rival.rotation_deg:.1f} deg fits as well; the guess rules "
+                    "it out"
+                )
+            continue
+        kept.append(rival)
+    return kept
+
+
+def _alternative(
+    model: MeasurementModel, rival: Rival, points: np.ndarray, tolerance_mm: float
+) -> Alternative:
+    """A rival as the result lists it."""
+    deviation = model.residuals(_batch(rival.part_from_camera), points, feet="samples").deviation_mm
+    return Alternative(
+        part_from_camera=rival.part_from_camera,
+        rotation_deg=rival.rotation_deg,
+        translation_mm=rival.translation_mm,
+        inlier_share=float(np.mean(np.abs(deviation) <= tolerance_mm)),
+    )
+
+
+def _tolerance(model: MeasurementModel, poses: RigidTransform, points: np.ndarray) -> np.ndarray:
+    """[H] largest deviation of an inlier, mm: three robust standard deviations, within bounds."""
+    radius = model.part.radius
+    level = 3 * noise_level(model, poses, points)
+    return np.clip(level, LEAST_TOLERANCE * radius, MOST_TOLERANCE * radius)
+
+
+def _view(scan: MeasuredScan, points: np.ndarray) -> View | None:
+    return None if scan.sensor_origin is None else View(points, scan.sensor_origin)
+
+
+def _batch(pose: RigidTransform) -> RigidTransform:
+    return RigidTransform(pose.rotation[None], pose.translation[None])
+
+
+def _checked(init: RigidTransform) -> RigidTransform:
+    """The guess as float64, if it is one pose."""
+    rotation = np.asarray(init.rotation, np.float64)
+    translation = np.asarray(init.translation, np.float64)
+    if rotation.shape != (3, 3) or translation.shape != (3,):
+        raise InputError(f"init must be one pose, got rotations of shape {rotation.shape}")
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    if not (orthonormal and np.linalg.det(rotation) > 0 and np.isfinite(translation).all()):
+        raise InputError(
+            "init is no rigid motion: its rotation is not orthonormal and right-handed"
+        )
+    return RigidTransform(rotation, translation)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Adds the wall time of a stage to ``seconds``."""
+    start = time.perf_counter()
+    yield
+    seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start

@@ -1,0 +1,255 @@
+"""Figures of one registration: where the scan deviates from the CAD model, and by how much."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize, to_rgb
+from matplotlib.figure import Figure
+
+from vanejax.measured_scan import MeasuredScan
+from vanejax.part import Part
+from vanejax.plotting.canvas import (
+    INK,
+    REFERENCE_RED,
+    SOURCE_GREEN,
+    new_figure,
+    style_chart,
+)
+from vanejax.plotting.scene import Picture, Scene, reader_rotation, show
+from vanejax.pose_result import PointStatus, PoseResult, Verification
+from vanejax.rigid import RigidTransform
+
+# blue below the surface, red above it; ColorBrewer's scale, safe for every kind of colour vision
+DEVIATION_COLORMAP = "RdYlBu_r"
+NO_PARTNER = "#8b3fb0"
+STATUS_COLORS = {
+    PointStatus.INLIER: SOURCE_GREEN,
+    PointStatus.BEFORE: "#e69f00",
+    PointStatus.BEHIND: "#d55e00",
+    PointStatus.BESIDE: NO_PARTNER,
+}
+# the second look on the same scan: far enough round to see what the first one foreshortens
+OBLIQUE_YAW_DEG, OBLIQUE_PITCH_DEG = 48.0, 18.0
+_PANEL_IN = 4.6
+_MAX_DOTS = 100_000
+
+
+def deviation_map(
+    result: PoseResult, scan: MeasuredScan, part: Part, *, scene: Scene | None = None
+) -> Figure:
+    """Signed distance of the checked points to the CAD surface, from two sides.
+
+    Args:
+      result: with `Verification.deviation_mm`; points without a partner get a colour of their own.
+      scan: what was registered.
+      part: to what.
+      scene: of the same part, if there is one already.
+    """
+    pictures = deviation_pictures(result, scan, part, scene=scene)
+    limit = color_limit_mm(result.verification)
+    figure = new_figure(2 * _PANEL_IN + 1.1, _PANEL_IN * _tallest(pictures) + 0.9)
+    panels = figure.subplots(1, 2)
+    for axes, picture, title in zip(
+        panels, pictures, ("from the sensor's side", "from further left and above"), strict=True
+    ):
+        show(axes, picture)
+        axes.set_title(title, color=INK, fontsize=11)
+    scale = ScalarMappable(Normalize(-limit, limit), colormaps[DEVIATION_COLORMAP])
+    bar = figure.colorbar(scale, ax=panels, fraction=0.025, pad=0.02, extend="both")
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(colors=INK, labelsize=9, length=0)
+    bar.ax.set_ylabel(
+        "deviation from the CAD surface (mm), + outside the material", color=INK, fontsize=10
+    )
+    lost = np.count_nonzero(np.isnan(result.verification.deviation_mm))
+    if lost:
+        share = 100 * lost / len(result.verification.deviation_mm)
+        entry = panels[0].scatter(
+            [], [], s=36, color=NO_PARTNER, linewidths=0,
+            label=f"no partner on the part ({share:.1f} %)",
+        )  # fmt: skip
+        figure.legend(
+            handles=[entry], loc="outside lower center", frameon=False, fontsize=10,
+            labelcolor=INK, handletextpad=0.2,
+        )  # fmt: skip
+    return figure
+
+
+def residual_histogram(result: PoseResult) -> Figure:
+    """How many checked points deviate by how much, by their status, with the noise beside.
+
+    The curve is white noise of `Refinement.noise_mm` with as many points as there are inliers.
+    Deviations are distances along the surface's normal; noise along the ray looks narrower there.
+    """
+    verification = result.verification
+    finite = np.isfinite(verification.deviation_mm)
+    deviation = verification.deviation_mm[finite]
+    status = verification.status[finite]
+    limit = float(np.fmax(1.6 * verification.tolerance_mm, color_limit_mm(verification)))
+    edges = np.linspace(-limit, limit, 97)
+    figure = new_figure(6.6, 3.9)
+    axes = figure.subplots()
+    style_chart(axes, xlabel="deviation from the CAD surface (mm)", ylabel="points")
+    shown = [s for s in PointStatus if (status == s).any()]
+    if shown:
+        axes.hist(
+            [deviation[status == s] for s in shown], edges, stacked=True, histtype="stepfilled",
+            color=[STATUS_COLORS[s] for s in shown], label=[s.name.lower() for s in shown],
+        )  # fmt: skip
+    noise = result.refinement.noise_mm
+    inliers = np.count_nonzero(status == PointStatus.INLIER)
+    if np.isfinite(noise) and noise > 0 and inliers:
+        x = np.linspace(-limit, limit, 401)
+        density = np.exp(-0.5 * (x / noise) ** 2) / (noise * np.sqrt(2 * np.pi))
+        axes.plot(
+            x, inliers * (edges[1] - edges[0]) * density, color=INK, linewidth=1.4,
+            label=f"noise, σ = {noise:.3g} mm",
+        )  # fmt: skip
+    if np.isfinite(verification.tolerance_mm):
+        for sign, label in ((-1, "tolerance"), (1, "_nolegend_")):
+            edge = sign * verification.tolerance_mm
+            axes.axvline(edge, color=INK, linewidth=1, linestyle=(0, (4, 3)), label=label)
+    beyond = np.count_nonzero(np.abs(deviation) > limit)
+    if beyond:
+        axes.set_title(
+            f"{beyond:,} points lie beyond ±{limit:.3g} mm", color=INK, fontsize=9, loc="right"
+        )
+    axes.set_xlim(-limit, limit)
+    entries = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    order = [name for name in (*(s.name.lower() for s in shown), *entries) if name in entries]
+    figure.legend(
+        [entries[name] for name in dict.fromkeys(order)], list(dict.fromkeys(order)),
+        loc="outside upper center", ncols=6, frameon=False, fontsize=9, labelcolor=INK,
+        handlelength=1.4, columnspacing=1.4,
+    )  # fmt: skip
+    return figure
+
+
+def overlay_before_after(
+    result: PoseResult, scan: MeasuredScan, part: Part, *, scene: Scene | None = None
+) -> Figure:
+    """The scan (green) on the CAD model (red) at the first guess and at the result.
+
+    Args:
+      result: `PoseResult.before` and `PoseResult.part_from_camera` are drawn.
+      scan: of more than 100,000 points a random choice is drawn.
+      part: to what it was registered.
+      scene: of the same part, if there is one already.
+    """
+    pictures = overlay_pictures(result, scan, part, scene=scene)
+    figure = new_figure(2 * _PANEL_IN + 0.2, _PANEL_IN * _tallest(pictures) + 0.9)
+    for axes, picture, title in zip(
+        figure.subplots(1, 2), pictures, ("before", "after"), strict=True
+    ):
+        show(axes, picture)
+        axes.set_title(title, color=INK, fontsize=11, fontweight="bold")
+    entries = [
+        figure.axes[0].scatter([], [], s=36, color=color, label=label, linewidths=0)
+        for color, label in ((SOURCE_GREEN, "scan"), (REFERENCE_RED, "CAD"))
+    ]
+    figure.legend(
+        handles=entries, loc="outside lower center", ncols=2, frameon=False, fontsize=10,
+        labelcolor=INK, handletextpad=0.2,
+    )  # fmt: skip
+    return figure
+
+
+def color_limit_mm(verification: Verification) -> float:
+    """Where the colours of deviations end: a round figure that 98 % of them stay below."""
+    deviation = np.abs(verification.deviation_mm[np.isfinite(verification.deviation_mm)])
+    wanted = float(np.percentile(deviation, 98)) if len(deviation) else 0.0
+    wanted = max(wanted, 1e-3)
+    power = 10.0 ** np.floor(np.log10(wanted))
+    steps = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+    # a rounding error above a step is that step
+    return float(power * next(step for step in steps if step * power >= wanted * (1 - 1e-9)))
+
+
+def deviation_colors(deviation_mm: np.ndarray, limit_mm: float) -> np.ndarray:
+    """Colours [n, 3], 0 to 1, of signed deviations [n] in mm; NaN has a colour of its own."""
+    colors = colormaps[DEVIATION_COLORMAP](Normalize(-limit_mm, limit_mm)(deviation_mm))[:, :3]
+    colors[np.isnan(deviation_mm)] = to_rgb(NO_PARTNER)
+    return colors
+
+
+def deviation_pictures(
+    result: PoseResult, scan: MeasuredScan, part: Part, *, scene: Scene | None = None
+) -> tuple[Picture, Picture]:
+    """The two pictures of `deviation_map`: as the sensor sees it, and from further round."""
+    scene = scene or Scene(part)
+    verification = result.verification
+    pose = result.part_from_camera
+    some = _choice(len(verification.checked))
+    points = pose.apply(scan.points[verification.checked[some]])
+    colors = deviation_colors(verification.deviation_mm[some], color_limit_mm(verification))
+    first = reader_rotation(scan, part, pose)
+    second = reader_rotation(scan, part, pose, yaw_deg=OBLIQUE_YAW_DEG, pitch_deg=OBLIQUE_PITCH_DEG)
+    one, other = (
+        scene.draw(
+            reader, points, colors, frame=scene.frame(reader, [points]),
+            lift_mm=_lift_mm(result),
+        )
+        for reader in (first, second)
+    )  # fmt: skip
+    return one, other
+
+
+def overlay_pictures(
+    result: PoseResult, scan: MeasuredScan, part: Part, *, scene: Scene | None = None
+) -> tuple[Picture, Picture]:
+    """The two pictures of `overlay_before_after`, of the same size and from the same side."""
+    scene = scene or Scene(part)
+    reader = overlay_rotation(scan, part, result.part_from_camera)
+    some = scan.points[_choice(len(scan.points))]
+    clouds = [pose.apply(some) for pose in (result.before, result.part_from_camera)]
+    frame = scene.frame(reader, clouds)
+    color = np.tile(to_rgb(SOURCE_GREEN), (len(some), 1))
+    before, after = (
+        scene.draw(reader, cloud, color, frame=frame, part_color=REFERENCE_RED) for cloud in clouds
+    )
+    return before, after
+
+
+def pose_picture(
+    scan: MeasuredScan,
+    part: Part,
+    part_from_camera: RigidTransform,
+    *,
+    scene: Scene | None = None,
+    pixels: int = 360,
+) -> Picture:
+    """The scan (green) on the CAD model (red) at any pose, a small picture for alternatives."""
+    scene = scene or Scene(part)
+    reader = overlay_rotation(scan, part, part_from_camera)
+    cloud = part_from_camera.apply(scan.points[_choice(len(scan.points))])
+    return scene.draw(
+        reader, cloud, np.tile(to_rgb(SOURCE_GREEN), (len(cloud), 1)),
+        frame=scene.frame(reader, [cloud]), part_color=REFERENCE_RED, pixels=pixels,
+    )  # fmt: skip
+
+
+def overlay_rotation(
+    scan: MeasuredScan, part: Part, part_from_camera: RigidTransform
+) -> np.ndarray:
+    """reader_from_part [3, 3] of overlays: beside the sensor, where errors along its rays show."""
+    return reader_rotation(scan, part, part_from_camera, yaw_deg=28.0, pitch_deg=14.0)
+
+
+def _choice(count: int) -> np.ndarray | slice:
+    """Which of so many points are drawn: all, or a random choice that has no pattern."""
+    if count <= _MAX_DOTS:
+        return slice(None)
+    return np.random.default_rng(0).choice(count, _MAX_DOTS, replace=False)
+
+
+def _lift_mm(result: PoseResult) -> float:
+    """How far below the surface a point is still drawn on it: what noise alone may do."""
+    tolerance = result.verification.tolerance_mm
+    return tolerance if np.isfinite(tolerance) else 0.0
+
+
+def _tallest(pictures: tuple[Picture, Picture]) -> float:
+    """The larger height per width."""
+    return max(picture.height_per_width for picture in pictures)

@@ -1,0 +1,276 @@
+"""The page: what `register` found, in the order in which an engineer asks for it."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import datetime
+import hashlib
+import importlib.metadata
+import os
+import platform
+import warnings
+from pathlib import Path
+
+import jinja2
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
+
+from vanejax.errors import InputError
+from vanejax.measured_scan import MeasuredScan
+from vanejax.part import Part
+from vanejax.plotting.deviation import (
+    STATUS_COLORS,
+    color_limit_mm,
+    deviation_pictures,
+    overlay_pictures,
+    pose_picture,
+    residual_histogram,
+)
+from vanejax.plotting.scene import Scene
+from vanejax.pose_result import Alternative, PointStatus, PoseResult, Uncertainty
+from vanejax.report.pictures import Image, color_bar, figure_uris, image
+from vanejax.report.viewer import viewer
+from vanejax.report.wording import (
+    degrees,
+    direction,
+    fixed,
+    millimetres,
+    percent,
+    significant,
+)
+from vanejax.rigid import RigidTransform
+
+_PACKAGES = ("vanejax", "jax", "numpy", "scipy", "embreex", "trimesh")
+_MOST_PICTURES = 6
+_MEANING = {
+    PointStatus.INLIER: ("On the part", "within what the noise explains"),
+    PointStatus.BEFORE: ("Before it", "dust, a fixture, or a wrong pose"),
+    PointStatus.BEHIND: (
+        "Behind it",
+        "the ray would have gone through material: a free-space violation",
+    ),
+    PointStatus.BESIDE: ("Beside it", "no partner on the part: surroundings, or a wrong pose"),
+}
+_ADVICE = {
+    "accepted": "The scan confirms this pose.",
+    "ambiguous": "More than one pose explains this scan. Do not machine before it is decided.",
+    "rejected": "Do not use this pose.",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Pose:
+    """A pose in the forms that machines ask for; all of them text."""
+
+    matrix: list[list[str]]
+    quaternion: list[str]
+    euler: list[str]
+    translation: list[str]
+    locked: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class _Share:
+    """One status of the checked points."""
+
+    name: str
+    meaning: str
+    color: str
+    share: float
+    count: int
+
+
+@dataclasses.dataclass(frozen=True)
+class _AgainstTruth:
+    """How far the pose is from a known one, in the terms of `Uncertainty`."""
+
+    rotation_deg: float
+    translation_mm: float
+    axes_deg: list[str]
+    axes_mm: list[str]
+    chi_square: float
+    limit: float
+
+
+@dataclasses.dataclass(frozen=True)
+class _Other:
+    """An alternative with its picture, if it has one."""
+
+    alternative: Alternative
+    pose: _Pose
+    image: Image | None
+
+
+def write_report(
+    path: str | os.PathLike[str],
+    result: PoseResult,
+    scan: MeasuredScan,
+    part: Part,
+    *,
+    truth: RigidTransform | None = None,
+) -> None:
+    """Writes what was found as one HTML file that needs no network and no other file.
+
+    It opens in any browser of the last years, on a tablet and on paper too. The interactive view
+    needs WebGL 2; without it the pictures remain. The page's policy forbids every request and
+    every script but its own. It appears complete or not at all.
+
+    Args:
+      path: ending in .html or .htm.
+      result: of `vanejax.register`.
+      scan: what was registered; mm, its own frame.
+      part: to what.
+      truth: part_from_camera, where it is known, as for virtual scans: the error is stated too.
+
+    Raises:
+      InputError: another suffix, a folder that cannot be written, or a result of another scan.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{path}: a report is an HTML file; let its name end in .html")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}; make it first")
+    checked = result.verification.checked
+    if len(checked) and (checked.min() < 0 or checked.max() >= len(scan.points)):
+        raise InputError(
+            f"the result checks point {int(checked.max())}, but the scan {scan.name!r} has "
+            f"{len(scan.points)}: it is another scan's result"
+        )
+    text = _html(result, scan, part, truth)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(text, encoding="utf-8", newline="\n")
+        os.replace(partial, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransform | None) -> str:
+    """The page's text."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("vanejax", "report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    for words in (degrees, direction, fixed, millimetres, percent, significant):
+        environment.filters[words.__name__] = words
+    loader = environment.loader
+    style, script = (loader.get_source(environment, name)[0] for name in ("page.css", "viewer.js"))
+    scene = Scene(part)
+    before, after = overlay_pictures(result, scan, part, scene=scene)
+    moved = _difference(result.before, result.part_from_camera, part.center)
+    return environment.get_template("page.html").render(
+        result=result,
+        scan=scan,
+        part=part,
+        advice=_ADVICE[result.verdict.status],
+        pose=_pose(result.part_from_camera),
+        inverse=_pose(result.camera_from_part),
+        shares=_shares(result),
+        moved_deg=float(np.degrees(np.linalg.norm(moved[:3]))),
+        moved_mm=float(np.linalg.norm(moved[3:])),
+        before=image(before),
+        after=image(after),
+        deviations=[image(p) for p in deviation_pictures(result, scan, part, scene=scene)],
+        lost=float(np.isnan(result.verification.deviation_mm).mean())
+        if len(result.verification.deviation_mm)
+        else 0.0,
+        limit_mm=color_limit_mm(result.verification),
+        color_bar=color_bar(),
+        histogram=figure_uris(residual_histogram(result)),
+        others=_others(result, scan, part, scene),
+        truth=None if truth is None else _against_truth(result, truth),
+        viewer=viewer(result, scan, part),
+        total_seconds=sum(result.seconds.values()),
+        slowest_seconds=max([*result.seconds.values(), 1e-9]),
+        versions={name: importlib.metadata.version(name) for name in _PACKAGES},
+        python=platform.python_version(),
+        system=platform.platform(terse=True),
+        written=datetime.datetime.now().astimezone().isoformat(sep=" ", timespec="seconds"),
+        style=style,
+        script=script,
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+    )
+
+
+def _pose(transform: RigidTransform) -> _Pose:
+    """The transform's numbers as text."""
+    matrix = np.asarray(transform.as_matrix(), np.float64)
+    rotation = Rotation.from_matrix(matrix[:3, :3])
+    with warnings.catch_warnings():
+        # scipy warns where only the sum of two angles is defined; the page says so instead
+        warnings.simplefilter("ignore", UserWarning)
+        euler = rotation.as_euler("xyz", degrees=True)
+    x, y, z, w = rotation.as_quat(canonical=True)
+    return _Pose(
+        matrix=[
+            [fixed(v, 4 if column == 3 else 8) for column, v in enumerate(row)]
+            for row in matrix[:3]
+        ]
+        + [["0", "0", "0", "1"]],
+        quaternion=[fixed(v, 8) for v in (w, x, y, z)],
+        euler=[fixed(v, 5) for v in euler],
+        translation=[fixed(v, 4) for v in matrix[:3, 3]],
+        locked=bool(abs(abs(euler[1]) - 90) < 1e-4),
+    )
+
+
+def _difference(true: RigidTransform, found: RigidTransform, center: np.ndarray) -> np.ndarray:
+    """The error [6] of `Uncertainty`, rad and mm: what takes ``found`` to ``true``."""
+    error = true @ found.inverse()
+    rotation = np.asarray(error.rotation, np.float64)
+    turned = Rotation.from_matrix(rotation).as_rotvec()
+    return np.concatenate([turned, error.translation + rotation @ center - center])
+
+
+def _against_truth(result: PoseResult, truth: RigidTransform) -> _AgainstTruth:
+    """The error, and its chi-square under the covariance: e^T C^-1 e, six degrees of freedom."""
+    uncertainty: Uncertainty = result.uncertainty
+    error = _difference(truth, result.part_from_camera, uncertainty.center)
+    try:
+        chi_square = float(error @ np.linalg.solve(uncertainty.covariance, error))
+    except np.linalg.LinAlgError:
+        chi_square = float("nan")
+    return _AgainstTruth(
+        rotation_deg=float(np.degrees(np.linalg.norm(error[:3]))),
+        translation_mm=float(np.linalg.norm(error[3:])),
+        axes_deg=[fixed(v, 5) for v in np.degrees(error[:3])],
+        axes_mm=[fixed(v, 5) for v in error[3:]],
+        chi_square=chi_square,
+        limit=float(chdtri(6, 0.05)),
+    )
+
+
+def _shares(result: PoseResult) -> list[_Share]:
+    """How many of the checked points have each status."""
+    status = result.verification.status
+    found = []
+    for value in PointStatus:
+        name, meaning = _MEANING[value]
+        count = int(np.count_nonzero(status == value))
+        share = count / max(1, len(status))
+        # the ray's side of a surface has a meaning only if there is a ray
+        if value is PointStatus.BEHIND and np.isnan(result.verification.violation_share):
+            share = float("nan")
+        found.append(_Share(name, meaning, STATUS_COLORS[value], share, count))
+    return found
+
+
+def _others(result: PoseResult, scan: MeasuredScan, part: Part, scene: Scene) -> list[_Other]:
+    """The alternatives; the first few with a picture, each from beside its own sensor."""
+    return [
+        _Other(
+            alternative,
+            _pose(alternative.part_from_camera),
+            image(pose_picture(scan, part, alternative.part_from_camera, scene=scene))
+            if index < _MOST_PICTURES
+            else None,
+        )
+        for index, alternative in enumerate(result.alternatives)
+    ]

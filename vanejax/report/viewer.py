@@ -1,0 +1,203 @@
+"""What the interactive view shows, as JSON: positions as 16-bit integers, poses as matrices.
+
+A report of a part with ten million triangles must still open on a tablet, so the surface is
+simplified where it has more vertices than 16 bits can count, and of the points a choice is shown.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import to_rgb
+from scipy.spatial import cKDTree
+
+from vanejax.measured_scan import MeasuredScan
+from vanejax.part import Part
+from vanejax.plotting.canvas import SOURCE_GREEN
+from vanejax.plotting.deviation import (
+    DEVIATION_COLORMAP,
+    NO_PARTNER,
+    color_limit_mm,
+    overlay_rotation,
+)
+from vanejax.pose_result import PoseResult
+from vanejax.rigid import RigidTransform
+
+MAX_VERTICES = 65_535
+MAX_POINTS = 60_000
+_NO_DEVIATION = -32768
+_MICROMETRES = 1000.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Viewer:
+    """The view's data, and what was left out to keep it small.
+
+    Attributes:
+      json: for `viewer.js`; safe inside an HTML script element.
+      poses: the names of the poses that can be shown, in the order of the buttons.
+      num_points: of the scan, shown.
+      num_faces: of the part, shown.
+      detail_mm: details of the part smaller than this are not shown; 0 where all are.
+    """
+
+    json: str
+    poses: tuple[str, ...]
+    num_points: int
+    num_faces: int
+    detail_mm: float
+
+
+def viewer(result: PoseResult, scan: MeasuredScan, part: Part) -> Viewer:
+    """The part, the checked points and every pose of a result.
+
+    Points are the checked ones; the whole scan where none was checked.
+    """
+    verification = result.verification
+    chosen, deviation = verification.checked, verification.deviation_mm
+    if not len(chosen):
+        chosen, deviation = np.arange(len(scan.points)), np.full(len(scan.points), np.nan)
+    if len(chosen) > MAX_POINTS:
+        some = np.sort(np.random.default_rng(0).choice(len(chosen), MAX_POINTS, replace=False))
+        chosen, deviation = chosen[some], deviation[some]
+    points = scan.points[chosen]
+    poses = [("Before", result.before), ("After", result.part_from_camera)]
+    poses += [
+        (f"Alternative {number}", alternative.part_from_camera)
+        for number, alternative in enumerate(result.alternatives, 1)
+    ]
+    vertices, faces, detail_mm = simplified(
+        np.asarray(part.mesh.vertices, np.float64), np.asarray(part.mesh.faces)
+    )
+    local_from_part = RigidTransform(np.eye(3), -part.center)
+    point_grid, camera_from_grid = _grid(points)
+    vertex_grid, part_from_grid = _grid(vertices)
+    limit_mm = color_limit_mm(verification)
+    reader_from_part = overlay_rotation(scan, part, result.part_from_camera)
+    half = np.abs((vertices - part.center) @ reader_from_part.T).max(axis=0)
+    scene = {
+        "radius": part.radius,
+        "half_mm": half.tolist(),
+        "view": _columns(RigidTransform(reader_from_part, np.zeros(3)).as_matrix()),
+        "mesh": {
+            "vertices": _base64(vertex_grid, "<u2"),
+            "faces": _base64(faces, "<u2"),
+            "model": _columns(local_from_part.as_matrix() @ part_from_grid),
+        },
+        "scan": {
+            "points": _base64(point_grid, "<u2"),
+            "deviation_um": _base64(_micrometres(deviation), "<i2"),
+            "spacing_mm": _spacing_mm(points),
+            # little enough to hide behind the thinnest wall
+            "lift_mm": min(limit_mm, 0.005 * part.radius),
+        },
+        "poses": [
+            {
+                "name": name,
+                "measured": name == "After",
+                "model": _columns((local_from_part @ pose).as_matrix() @ camera_from_grid),
+            }
+            for name, pose in poses
+        ],
+        "limit_mm": limit_mm,
+        "colors": _base64(
+            np.round(255 * colormaps[DEVIATION_COLORMAP](np.linspace(0, 1, 256))), "u1"
+        ),
+        "scan_color": to_rgb(SOURCE_GREEN),
+        "lost_color": to_rgb(NO_PARTNER),
+    }
+    return Viewer(
+        # "<" could end the script element
+        json=json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        poses=tuple(name for name, _ in poses),
+        num_points=len(points),
+        num_faces=len(faces),
+        detail_mm=detail_mm,
+    )
+
+
+def simplified(
+    vertices: np.ndarray, faces: np.ndarray, *, max_vertices: int = MAX_VERTICES
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """A surface of at most ``max_vertices``: all vertices in a cell of a grid become their mean.
+
+    Vertex clustering (Rossignac and Borrel, 1993): in time linear in the vertices, for any mesh,
+    and good enough to look at.
+
+    Args:
+      vertices: [V, 3] f64, mm.
+      faces: [F, 3], indices.
+      max_vertices: at least 8.
+
+    Returns:
+      vertices [v, 3]; faces [f, 3]; the side of the cells in mm, 0 where nothing was done.
+    """
+    if len(vertices) <= max_vertices:
+        return vertices, faces, 0.0
+    low = vertices.min(axis=0)
+    corners = vertices[faces]
+    area = 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    # a plane at any angle crosses about 1.5 cells per cell's area
+    side = float(np.sqrt(1.5 * area.sum() / max_vertices))
+    while True:
+        cell = np.floor((vertices - low) / side).astype(np.int64)
+        size = cell.max(axis=0) + 1
+        flat = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+        _, cluster, count = np.unique(flat, return_inverse=True, return_counts=True)
+        if len(count) <= max_vertices:
+            break
+        side *= 1.15
+    means = np.stack(
+        [np.bincount(cluster, weights=vertices[:, axis]) / count for axis in range(3)], axis=1
+    )
+    merged = cluster[faces]
+    a, b, c = merged.T
+    merged = merged[(a != b) & (b != c) & (c != a)]
+    # of several faces with the same corners one is enough, from whichever side it is seen
+    _, first = np.unique(np.sort(merged, axis=1), axis=0, return_index=True)
+    return means, merged[first], side
+
+
+def _grid(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points [N, 3] on a grid of 65,535 steps a side, and the matrix [4, 4] that undoes it.
+
+    WebGL reads 16-bit integers as 0 to 1. Half a step is 1 micrometre on a part of 130 mm.
+    """
+    if not len(points):
+        return points, np.eye(4)
+    low = points.min(axis=0)
+    size = np.maximum(np.ptp(points, axis=0), 1e-9)
+    matrix = np.diag([*size, 1.0])
+    matrix[:3, 3] = low
+    return np.round((points - low) / size * 65_535), matrix
+
+
+def _micrometres(deviation_mm: np.ndarray) -> np.ndarray:
+    """Deviations [n] mm in whole micrometres, cut at 32.767 mm; -32768 for none."""
+    whole = np.clip(np.round(_MICROMETRES * deviation_mm), -32767, 32767)
+    return np.where(np.isnan(deviation_mm), _NO_DEVIATION, whole)
+
+
+def _spacing_mm(points: np.ndarray) -> float:
+    """Typical distance between neighbours among points [N, 3]."""
+    if len(points) < 2:
+        return 1.0
+    some = points[:: max(1, len(points) // 1000)]
+    return max(float(np.median(cKDTree(points).query(some, k=2)[0][:, 1])), 1e-6)
+
+
+def _base64(values: Sequence[float] | np.ndarray, dtype: str) -> str:
+    """Little-endian bytes as text."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype).tobytes()).decode("ascii")
+
+
+def _columns(matrix: np.ndarray) -> list[float]:
+    """A 4x4 matrix as WebGL wants it: column after column."""
+    return np.asarray(matrix, np.float64).T.ravel().tolist()
