@@ -296,8 +296,20 @@ def test_text_without_names(tmp_path):
     assert np.array_equal(read_points(put(tmp_path, "d.csv", rows)).points, [[1.5, 2.5, 3.5]] * 2)
     trailing = b"1.5,2.5,3.5,\n4.5,5.5,nan,\n"
     expected = [[1.5, 2.5, 3.5], [4.5, 5.5, np.nan]]
-    found = read_points(put(tmp_path, "e.csv", trailing)).points
-    assert np.array_equal(found, expected, equal_nan=True)
+    found = read_points(put(tmp_path, "e.csv", trailing))
+    assert np.array_equal(found.points, expected, equal_nan=True)
+    assert found.notes == ()
+
+
+def test_padding_after_the_last_point_is_no_point(tmp_path):
+    for name, data in (("a.ply", PLY), ("a.pcd", PCD), ("a.ply", PLY_TEXT), ("a.pcd", PCD_TEXT)):
+        file = read_points(put(tmp_path, name, data + (b"\n" if b"ascii" in data else b"\0") * 99))
+        assert np.array_equal(file.points, read_points(put(tmp_path, name, data)).points)
+
+
+def test_a_byte_order_mark_is_no_part_of_the_first_number(tmp_path):
+    file = read_points(put(tmp_path, "a.csv", b"\xef\xbb\xbf1.5,2.5,3.5\n4,5,6\n"))
+    assert np.array_equal(file.points, [[1.5, 2.5, 3.5], [4, 5, 6]])
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from vanejax.point_records import PointFile
 from vanejax.scan_file import robust_extent
 from vanejax.sensor_place import sampled_rows, why_not_from
 from vanejax.solid_bodies import connected
-from vanejax.triangles import Edges, Triangles, signed_volume, weld
+from vanejax.triangles import Edges, Triangles, weld
 
 # diagonals of parts and scans that a structured-light scanner is used for
 _SMALLEST_MM, _LARGEST_MM = 5.0, 3000.0
@@ -61,7 +61,7 @@ class Inspection:
       looks_along: ``"+z"`` or ``"-z"``, from the sensor to the points; None if neither.
       watertight: whether the faces of a mesh, as written, close.
       bodies: connected pieces of a mesh.
-      volume_mm3: of a closed mesh, in its likely unit.
+      volume_mm3: of the solid, if the mesh is one or can be repaired to one, in its likely unit.
       notes: repairs and oddities, a sentence each.
       next_steps: commands that make sense now.
     """
@@ -229,8 +229,6 @@ def _inspect_mesh(path: Path, written: str) -> Inspection:
         pairs = np.concatenate([mesh.faces[:, :2], mesh.faces[:, 1:]])
         _, label = connected(pairs, len(mesh.points))
         bodies = len(np.unique(label[mesh.faces[:, 0]]))
-        if watertight:
-            volume = abs(signed_volume(mesh.corners())) * scale**3
     name = shlex.quote(str(path))
     option = _option("cad", units)
     try:

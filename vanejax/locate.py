@@ -15,7 +15,7 @@ from vanejax.matched_poses import icosahedral_rotations, match_poses
 from vanejax.measured_scan import MeasuredScan, clean_scan
 from vanejax.model_file import TrainedMatcher, load_model
 from vanejax.part import Part, load_part
-from vanejax.pose_result import Alternative, PoseResult, Verdict
+from vanejax.pose_result import Alternative, PoseResult
 from vanejax.pose_search import (
     Candidates,
     challenge,
@@ -49,7 +49,7 @@ REACH = 0.3  # of the part's radius: how far a surface partner is sought where n
 STARTS = (400, 1200)
 # a guess is good to this; a pose farther away that fits as well is no reason to doubt it
 GUESS_DEG, GUESS_SHIFT = 30.0, 0.3
-MATCH_ITERATIONS = 2  # of RPM-Net from each of 60 rotations; ray casting does the rest
+MATCH_ITERATIONS = 1  # of RPM-Net from each of 60 rotations: ray casting does the rest
 
 
 def register(
@@ -96,17 +96,14 @@ def register(
         if weights is not None:
             weights.check_part(part)
         init = None if init is None else _checked(init)
-        assumed = isinstance(sensor_origin, str) and sensor_origin == "auto"
-        if isinstance(scan, MeasuredScan):
-            assumed = False
-        elif isinstance(scan, np.ndarray):
+        if isinstance(scan, np.ndarray):
             scan = clean_scan(scan, sensor_origin=sensor_origin)
-        else:
+        elif not isinstance(scan, MeasuredScan):
             scan = load_scan(
                 scan, units=units_scan, part_extent_mm=part.extent_mm, sensor_origin=sensor_origin
             )
     result = _locate(scan, part, init, weights, limits, seed, seconds)
-    if assumed and scan.sensor_origin is not None and result.verdict.status == "rejected":
+    if scan.origin_is_assumed and result.verdict.status == "rejected":
         # perhaps the cloud was moved after it was taken: then the rays are wrong, not the pose
         merged = dataclasses.replace(
             scan,
@@ -138,9 +135,7 @@ def _locate(
     results = []
     for found in _sources(model, scan, init, weights, seed, seconds):
         result = _finish(model, scan, found, init, limits, seed, seconds)
-        if result.verdict.status == "accepted" or (
-            result.verdict.status == "ambiguous" and result.alternatives
-        ):
+        if result.verdict.status != "rejected":
             return result
         results.append(result)
     if init is not None:
@@ -210,10 +205,10 @@ def _finish(
             model,
             select(pool.part_from_camera, slice(0, 1 + RIVALS)),
             some,
-            iterations=10,
+            iterations=8,
             feet="samples",
             floor_mm=LEAST_TOLERANCE * part.radius,
-            settled_deg=0.01,
+            settled_deg=0.02,
         )
         view = _view(scan, some)
         level = float(_tolerance(model, poses, some).min())

@@ -32,6 +32,7 @@ class MeasuredScan:
       sensor_origin: [3] f64, mm, where the rays start; None if unknown (merged clouds, exports).
       name: for reports; the file's stem.
       notes: what was dropped or assumed, a sentence each.
+      origin_is_assumed: whether nobody said where the sensor stands, it only looks like it.
     """
 
     points: np.ndarray
@@ -39,6 +40,7 @@ class MeasuredScan:
     sensor_origin: np.ndarray | None
     name: str = "scan"
     notes: tuple[str, ...] = ()
+    origin_is_assumed: bool = False
 
     @functools.cached_property
     def looks_along(self) -> Literal["+z", "-z"] | None:
@@ -119,7 +121,8 @@ def clean_scan(
     scan = MeasuredScan(points, normals, origin, name)
     if origin is not None and scan.looks_along:
         notes[notes.index(reason)] += f", looking along {scan.looks_along}"
-    return dataclasses.replace(scan, notes=tuple(notes))
+    assumed = origin is not None and isinstance(sensor_origin, str)
+    return dataclasses.replace(scan, notes=tuple(notes), origin_is_assumed=assumed)
 
 
 def measured(points: np.ndarray) -> np.ndarray:

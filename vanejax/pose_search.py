@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.part import Part
 from vanejax.refine import descend, subset
-from vanejax.residuals import MeasurementModel, RayCasting, moved
+from vanejax.residuals import MeasurementModel, RayCasting
 from vanejax.rigid import RigidTransform
 from vanejax.surface import Surface
 from vanejax.verification import View, evidence
@@ -28,6 +28,7 @@ KEPT = 16
 KEPT_POINTS = 3_000
 KEPT_ITERATIONS = 15
 CHALLENGED = 12
+HOPELESS = 0.6  # of the best score: what ends below is no rival
 CHALLENGE_POINTS = 600
 CHALLENGE_ITERATIONS = 10
 LEAST_TOLERANCE = 0.005  # of the part's radius, while poses are still on their way
@@ -117,7 +118,7 @@ def search(
     few = points[subset(points, START_POINTS, seed)]
     poses = starts(model, few, spread_rotations(count)) if count else None
     if poses is not None:
-        poses, _ = descend(model, poses, few, iterations=START_ITERATIONS)
+        poses, _ = descend(model, poses, few, iterations=START_ITERATIONS, settled_deg=0.5)
     if extra is not None:
         poses = extra if poses is None else concatenate(extra, poses)
     tolerance = 0.03 * model.part.radius
@@ -188,7 +189,11 @@ def challenge(
     """The candidates and the best of those `challengers` that end elsewhere, sorted anew."""
     few = points[subset(points, CHALLENGE_POINTS, seed + 4)]
     rivals, _ = descend(
-        model, challengers(model.surface, found.pose(0)), few, iterations=CHALLENGE_ITERATIONS
+        model,
+        challengers(model.surface, found.pose(0)),
+        few,
+        iterations=CHALLENGE_ITERATIONS,
+        settled_deg=0.2,
     )
     every = concatenate(select(found.part_from_camera, slice(0, CHALLENGED)), rivals)
     tolerance = 3 * float(noise_level(model, every, few).min())
@@ -197,6 +202,7 @@ def challenge(
     score = evidence(model, every, few, tolerance_mm=tolerance, view=view).total
     order = np.argsort(-score, kind="stable")
     order = order[distinct(select(every, order), model.part, CHALLENGED)]
+    order = order[score[order] >= HOPELESS * score[order[0]]]
     return Candidates(select(every, order), score[order])
 
 

@@ -31,12 +31,13 @@ MOST_POINTS = 400_000  # more of them improve the pose by less than the casting'
 SCALE_FLOOR = 0.01
 DEGREES_OF_FREEDOM = (1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, np.inf)
 CUTOFF = 5.0  # standard deviations; a normal distribution has 6e-7 beyond
-PATCHES = 16  # of the scan, along the longer side of its view
+# of the scan, along the longer side of its view, and how many times the variance of independent
+# points their scores must show: white noise stays below
+PATCHES = {16: 1.4, 8: 1.8}
 # rays flatter than 88.9 deg count as if they were not: one of them would outweigh 1e6 others, and a
 # pose wrong by less than its noise would already make it jump off the face
 LEAST_COSINE = 0.02
 NOISE_FITS = 4  # of the last stage's iterations
-CORRELATED = 1.4  # times the variance: white noise stays below in 170 patches
 SETTLED = 0.02  # of a standard deviation of the pose: a smaller step says nothing new
 
 
@@ -91,7 +92,7 @@ def descend(
       iterations: at most.
       feet: as in `MeasurementModel.residuals`.
       floor_mm: the kernel's scale is no smaller; default 1 % of the part's radius.
-      settled_deg: stop when no pose turns by more, nor moves by as much of the part's radius.
+      settled_deg: a pose that turns by less, and moves by less of the part's radius, is left.
 
     Returns:
       H poses, and the number of iterations done.
@@ -99,8 +100,13 @@ def descend(
     radius = model.part.radius
     floor = SCALE_FLOOR * radius if floor_mm is None else floor_mm
     damping = 1e-3 * np.diag([radius**2] * 3 + [1.0] * 3)
-    for done in range(1, iterations + 1):
-        now = model.residuals(part_from_camera, points, feet=feet)
+    rotation, translation = part_from_camera.rotation.copy(), part_from_camera.translation.copy()
+    moving = np.arange(len(rotation))
+    done = 0
+    while done < iterations and len(moving):
+        done += 1
+        poses = RigidTransform(rotation[moving], translation[moving])
+        now = model.residuals(poses, points, feet=feet)
         deviation = now.deviation_mm
         scale = 1.4826 * np.median(np.abs(deviation), axis=1)
         scale = 2 * np.clip(scale, floor, 0.3 * radius)[:, None]
@@ -113,10 +119,10 @@ def descend(
         turn = np.linalg.norm(delta[:, :3], axis=1)
         shift = np.linalg.norm(delta[:, 3:], axis=1) / radius
         delta /= np.maximum(1, np.maximum(turn / np.radians(20), shift / 0.2))[:, None]
-        part_from_camera = moved(model.part, part_from_camera, delta)
-        if np.degrees(max(turn.max(), shift.max())) < settled_deg:
-            break
-    return part_from_camera, done
+        poses = moved(model.part, poses, delta)
+        rotation[moving], translation[moving] = poses.rotation, poses.translation
+        moving = moving[np.degrees(np.maximum(turn, shift)) >= settled_deg]
+    return RigidTransform(rotation, translation), done
 
 
 def refine(
@@ -151,7 +157,7 @@ def refine(
         settled_deg=0.002,
     )
     iterations += more
-    patch = _patches(model, points)
+    patches = [_patches(model, points, across) for across in PATCHES]
     converged = False
     for step in range(max_iterations):
         iterations += 1
@@ -165,7 +171,7 @@ def refine(
         scores = weighted * along[:, None]
         information = weighted.T @ (now.jacobian[0] / cosine[:, None])
         delta, known = _solve(information, scores.sum(axis=0), model.part.radius)
-        information /= _inflation(information, scores - scores.mean(axis=0), patch)
+        information /= _inflation(information, scores - scores.mean(axis=0), patches)
         batch = moved(model.part, batch, -delta[None])
         if delta @ information @ delta < SETTLED**2 * 6:
             converged = bool(known)
@@ -315,29 +321,36 @@ def _solve(information: np.ndarray, gradient: np.ndarray, radius: float) -> tupl
     return step * unit, bool(known.all())
 
 
-def _patches(model: MeasurementModel, points: np.ndarray) -> np.ndarray:
+def _patches(model: MeasurementModel, points: np.ndarray, across: int) -> np.ndarray:
     """[n] i64: which patch of the scan a point is in; squares of the sensor's view, or cubes."""
     if isinstance(model, RayCasting):
         rays = points - model.sensor_origin
         rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         forward = rays.mean(axis=0)
         points = rays - np.outer(rays @ forward, forward) / (forward @ forward)
-    size = max(float(np.ptp(points, axis=0).max()), 1e-9) / PATCHES
+    size = max(float(np.ptp(points, axis=0).max()), 1e-9) / across
     cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
     _, patch = np.unique(cell @ np.array([1, 1 << 10, 1 << 20]), return_inverse=True)
     return patch
 
 
-def _inflation(information: np.ndarray, scores: np.ndarray, patch: np.ndarray) -> float:
-    """How much more the patches' scores vary than independent points would; at least 1."""
-    totals = np.stack([np.bincount(patch, weights=scores[:, k]) for k in range(6)], axis=1)
-    count = len(totals)
-    if count < 20:
-        return 1.0
-    between = totals.T @ totals * count / (count - 6)
-    try:
-        ratio = np.sort(np.linalg.eigvals(np.linalg.solve(information, between)).real)
-    except np.linalg.LinAlgError:
-        return 1.0
-    ratio = float(np.median(ratio))
-    return ratio if ratio > CORRELATED else 1.0
+def _inflation(information: np.ndarray, scores: np.ndarray, patches: list[np.ndarray]) -> float:
+    """How much more the patches' scores vary than independent points would; at least 1.
+
+    The median over the six directions of the sandwich's ratio, at each size of patches; the
+    largest that is more than chance.
+    """
+    largest = 1.0
+    for patch, chance in zip(patches, PATCHES.values(), strict=True):
+        totals = np.stack([np.bincount(patch, weights=column) for column in scores.T], axis=1)
+        count = len(totals)
+        if count < 20:
+            continue
+        between = totals.T @ totals * count / (count - 6)
+        try:
+            ratio = np.linalg.eigvals(np.linalg.solve(information, between)).real
+        except np.linalg.LinAlgError:
+            continue
+        if np.median(ratio) > chance:
+            largest = max(largest, float(np.median(ratio)))
+    return largest

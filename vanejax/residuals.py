@@ -13,7 +13,10 @@ in rad, translation in mm) in the part's frame about the part's centre c, applie
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal, Protocol
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,9 +26,12 @@ from vanejax.rigid import RigidTransform
 from vanejax.scanner import Scanner
 from vanejax.surface import Feet, Surface
 
+T = TypeVar("T")
+
 # How near the foot of a point on the surface is found: to a cell of a grid, to the spacing of
 # surface samples, or on the faces themselves; each is some ten times slower than the one before.
 Precision = Literal["grid", "samples", "faces"]
+BLOCK = 1 << 14  # rays at a time: their arrays stay in the cache
 MOST_EXACT = 20_000  # points; of more of them the samples will do
 
 
@@ -90,25 +96,35 @@ class RayCasting:
         """
         rays = points - self.sensor_origin
         range_mm = np.linalg.norm(rays, axis=-1)
-        turned = rays / range_mm[:, None] @ part_from_camera.rotation.swapaxes(-1, -2)
+        rays /= range_mm[:, None]
         sensor = part_from_camera.rotation @ self.sensor_origin + part_from_camera.translation
-        origins = np.broadcast_to(sensor[:, None], turned.shape)
-        hits = self.scanner.cast(origins.reshape(-1, 3), turned.reshape(-1, 3))
-        shape = turned.shape[:2]
-        hit = hits.face.reshape(shape) >= 0
-        normals = hits.normals.reshape(turned.shape)
-        predicted = np.where(hit, hits.distance_mm.reshape(shape), range_mm)
-        cosine = np.where(hit, -np.einsum("hni,hni->hn", normals, turned), 1.0)
-        deviation = (predicted - range_mm) * cosine
-        x = turned
-        x *= predicted[..., None]
-        x += (sensor - self.part.center)[:, None]
-        if not hit.all():
+        sensor -= self.part.center
+        shape = (len(sensor), len(points))
+        out = Residuals(
+            np.empty(shape), np.empty((*shape, 6)), np.empty(shape), np.empty(shape, bool)
+        )
+
+        def one(block: tuple[slice, slice]) -> None:
+            poses, some = block
+            turned = rays[some] @ part_from_camera.rotation[poses].swapaxes(-1, -2)
+            origins = sensor[poses, None]
+            hits = self.scanner.cast_unit(origins, turned)
+            hit, normals = hits.face >= 0, hits.normals
+            predicted = np.where(hit, hits.distance_mm, range_mm[some])
+            cosine = np.where(hit, -np.einsum("hni,hni->hn", normals, turned), 1.0)
+            deviation = (predicted - range_mm[some]) * cosine
+            turned *= predicted[..., None]
+            turned += origins  # now the predicted points, about the part's centre
             missed = ~hit
-            # about the centre, as everything here
-            distance, direction = _to_surface(self.surface, x[missed] + self.part.center, feet)
-            deviation[missed], normals[missed] = distance, direction
-        return Residuals(deviation, _jacobian(x, normals), cosine, hit)
+            if missed.any():
+                deviation[missed], normals[missed] = _to_surface(
+                    self.surface, turned[missed] + self.part.center, feet
+                )
+            out.deviation_mm[block], out.cosine[block], out.hit[block] = deviation, cosine, hit
+            _jacobian(turned, normals, out.jacobian[block])
+
+        _in_parallel(one, _blocks(*shape))
+        return out
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -145,7 +161,7 @@ class SurfaceMatching:
         normals = np.where(hit[:, None], found.normals, direction).reshape(moved.shape)
         return Residuals(
             deviation_mm=np.where(hit, deviation, distance).reshape(moved.shape[:2]),
-            jacobian=_jacobian(moved - self.part.center, normals),
+            jacobian=_jacobian(moved - self.part.center, normals, np.empty((*moved.shape[:2], 6))),
             cosine=np.ones(moved.shape[:2]),
             hit=hit.reshape(moved.shape[:2]),
         )
@@ -165,13 +181,33 @@ def _batch(poses: RigidTransform) -> tuple[int, ...]:
     return poses.rotation.shape[:-2]
 
 
-def _jacobian(x: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """[H, n, 6] of ``normals . (omega x x + v)`` for points about the part's centre."""
-    out = np.empty((*x.shape[:-1], 6))
+def _jacobian(x: np.ndarray, normals: np.ndarray, out: np.ndarray) -> np.ndarray:
+    """[H, n, 6] of ``normals . (omega x x + v)`` for points x about the part's centre."""
     for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
         out[..., k] = x[..., i] * normals[..., j] - x[..., j] * normals[..., i]
     out[..., 3:] = normals
     return out
+
+
+def _blocks(poses: int, points: int) -> list[tuple[slice, slice]]:
+    """Blocks of poses and points with about `BLOCK` rays each."""
+    if points >= BLOCK:
+        starts = range(0, points, BLOCK)
+        return [(slice(h, h + 1), slice(n, n + BLOCK)) for h in range(poses) for n in starts]
+    step = max(1, BLOCK // max(points, 1))
+    return [(slice(h, h + step), slice(None)) for h in range(0, poses, step)]
+
+
+def _in_parallel(work: Callable[[T], None], items: Sequence[T]) -> None:
+    """Calls ``work`` on each item; numpy, Embree and the k-d tree release the GIL."""
+    workers = min(len(items), os.cpu_count() or 1)
+    if workers < 2:
+        for item in items:
+            work(item)
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        for _ in pool.map(work, items):
+            pass
 
 
 def _to_surface(

@@ -129,25 +129,37 @@ class Scanner:
             raise InputError(
                 f"rays need [N, 3] origins and directions, got {origins.shape}, {directions.shape}"
             )
-        origins = origins - self._center
         length = np.linalg.norm(directions, axis=-1, keepdims=True)
         if not (np.isfinite(length).all() and np.isfinite(origins).all() and (length > 0).all()):
             raise InputError("rays need finite origins and finite directions that are not zero")
-        directions = directions / length
+        return self.cast_unit(origins - self._center, directions / length)
+
+    def cast_unit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
+        """`cast` without its checks, for the inner loop of a registration.
+
+        Args:
+          origins: [..., 3] f64 mm, about the part's centre; broadcast against ``directions``.
+          directions: [..., 3] f64, unit.
+
+        Returns:
+          Hits with [...] in place of [N].
+        """
         # jump to just before the part's bounding sphere, where float32 is finest
-        skip = -np.sum(origins * directions, axis=-1) - 1.01 * self._radius
-        starts = origins + np.maximum(skip, 0)[:, None] * directions
-        face = self._scene.run(starts.astype(np.float32), directions.astype(np.float32))
+        skip = -np.einsum("...i,...i->...", origins, directions) - 1.01 * self._radius
+        starts = origins + np.maximum(skip, 0)[..., None] * directions
+        face = self._scene.run(
+            starts.reshape(-1, 3).astype(np.float32), directions.reshape(-1, 3).astype(np.float32)
+        ).reshape(directions.shape[:-1])
         normals = self._normals[face]
-        closing = np.sum(normals * directions, axis=-1)
-        measured = (face >= 0) & (closing < -EDGE_ON_COSINE)
-        gap = self._plane_mm[face] - np.sum(normals * origins, axis=-1)
-        distance = np.divide(gap, closing, out=np.full_like(gap, np.inf), where=measured)
-        return Hits(
-            distance_mm=distance,
-            face=np.where(measured, face, -1).astype(np.int32),
-            normals=np.where(measured[:, None], normals, 0.0),
-        )
+        closing = np.einsum("...i,...i->...", normals, directions)
+        missed = (face < 0) | (closing >= -EDGE_ON_COSINE)
+        gap = self._plane_mm[face] - np.einsum("...i,...i->...", normals, origins)
+        closing[missed] = 1.0
+        distance = gap / closing
+        distance[missed] = np.inf
+        face[missed] = -1
+        normals[missed] = 0.0
+        return Hits(distance_mm=distance, face=face.astype(np.int32), normals=normals)
 
     def scan(
         self, camera: Camera, camera_from_part: RigidTransform, *, hidden: bool = False

@@ -70,7 +70,7 @@ class Surface:
 
     def nearest(self, points: np.ndarray) -> Feet:
         """The sample nearest to each point [n, 3]: right to about the samples' spacing."""
-        _, index = self._tree.query(points, workers=-1)
+        _, index = self._tree.query(points)
         return Feet(self.points[index], self.normals[index], self.face[index])
 
     def exact(self, points: np.ndarray) -> Feet:
@@ -79,7 +79,7 @@ class Surface:
         The nearest face of all can be missed where it is smaller than the samples' spacing; the
         foot point is then on its neighbour, off by less than that face.
         """
-        _, index = self._tree.query(points, k=CANDIDATES, workers=-1)
+        _, index = self._tree.query(points, k=CANDIDATES)
         faces = self.face[index].reshape(-1)
         triangles = self.part.mesh.vertices[self.part.mesh.faces[faces]]
         feet = closest_point(np.asarray(triangles), np.repeat(points, CANDIDATES, axis=0))

@@ -19,7 +19,10 @@ class Limits:
       least_inlier_share: of the points; clutter and other parts count against it.
       most_violation_share: of the points, those seen through material.
       most_unmeasured_share: of the surface that should have been measured.
-      most_noise: standard deviation of the inliers' deviations, of the part's radius.
+      most_noise: standard deviation of the inliers' deviations, of the part's radius; above it
+        the pose is rejected.
+      doubtful_noise: likewise; above it no pose is certain, since a sensor that is off by so much
+        seldom is so at random.
       least_inliers: points.
       least_preference: how many standard errors the patches of the scan must prefer the pose to
         each other pose that was tried.
@@ -30,7 +33,8 @@ class Limits:
     least_inlier_share: float = 0.6
     most_violation_share: float = 0.12
     most_unmeasured_share: float = 0.35
-    most_noise: float = 0.03
+    most_noise: float = 0.04
+    doubtful_noise: float = 0.02
     least_inliers: int = 40
     least_preference: float = 4.0
     most_rotation_sigma_deg: float = 1.0
@@ -75,6 +79,13 @@ def judge(
             f"the scan fits {_count(len(near))} nearly as well: one is turned by "
             f"{other.rotation_deg:.1f} deg and moved by {other.translation_mm:.2f} mm; "
             "a view that shows where they differ, or a rough pose, decides",
+        )
+    noise = verification.tolerance_mm / 3
+    if noise > limits.doubtful_noise * radius_mm:
+        return Verdict(
+            "ambiguous",
+            f"the points lie {noise:.2g} mm off the surface, {noise / radius_mm:.1%} of the part's "
+            "radius: the pose is the best one, but may be off by more than its uncertainty says",
         )
     if uncertainty.weakest_rotation_sigma_deg > limits.most_rotation_sigma_deg:
         return Verdict(

@@ -207,7 +207,8 @@ def overlay_pictures(
     frame = scene.frame(reader, clouds)
     color = np.tile(to_rgb(SOURCE_GREEN), (len(some), 1))
     before, after = (
-        scene.draw(reader, cloud, color, frame=frame, part_color=REFERENCE_RED) for cloud in clouds
+        scene.draw(reader, cloud, color, frame=frame, part_color=REFERENCE_RED, pixels=600)
+        for cloud in clouds
     )
     return before, after
 

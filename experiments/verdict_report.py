@@ -1,0 +1,183 @@
+"""What a study of verdicts says in numbers and pictures: ROC, verdicts by kind of pose."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import rankdata
+
+from vanejax.plotting.canvas import FAINT, INK, new_figure, style_chart
+from vanejax.plotting.charts import SERIES
+
+STATUSES = ("accepted", "ambiguous", "rejected")
+RIGHT, OTHER_PART = "right", "another part"
+# what may tell a right pose from a wrong one, signed so that more is better
+FIGURES = {
+    "score": "verification score",
+    "inlier_share": "inlier share",
+    "violation_share": "free-space violations (negative)",
+    "unmeasured_share": "unmeasured surface (negative)",
+    "preference": "preference to the best rival",
+}
+NEGATIVE = ("violation_share", "unmeasured_share")
+
+
+def roc(right: np.ndarray, wrong: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """False and true accept rates [T] over all thresholds, from accepting nothing to everything.
+
+    Args:
+      right, wrong: [n], [m] a figure of right and of wrong poses; larger is better.
+    """
+    thresholds = np.unique(np.concatenate([right, wrong]))[::-1]
+    rates = [(0.0, 0.0), *((np.mean(wrong >= t), np.mean(right >= t)) for t in thresholds)]
+    false_accepts, true_accepts = np.array(rates).T
+    return false_accepts, true_accepts
+
+
+def area_under_roc(right: np.ndarray, wrong: np.ndarray) -> float:
+    """The chance that a right pose's figure exceeds a wrong one's, half for equal ones.
+
+    The Mann-Whitney statistic.
+    """
+    ranks = rankdata(np.concatenate([right, wrong]))[: len(right)]
+    pairs = len(right) * len(wrong)
+    return float((ranks.sum() - len(right) * (len(right) + 1) / 2) / pairs)
+
+
+def figure_of(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """A figure of the right and of the wrong poses, signed so that more is better."""
+    sign = -1.0 if name in NEGATIVE else 1.0
+    return tuple(
+        sign * np.array([row[name] for row in rows if row["right"] is right], np.float64)
+        for right in (True, False)
+    )
+
+
+def summarize(
+    judged: Sequence[Mapping[str, Any]], runs: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """ROC figures, and verdicts by kind of pose and by sensor."""
+    figures = {}
+    for name in FIGURES:
+        right, wrong = figure_of(judged, name)
+        if len(right) and len(wrong):
+            figures[name] = {
+                "auc": area_under_roc(right, wrong),
+                "true_accepts_at_no_false": float(np.mean(right > wrong.max())),
+            }
+    kinds = dict.fromkeys(row["kind"] for row in judged)
+    sensors = dict.fromkeys(row["sensor"] for row in judged)
+    return {
+        "poses": {
+            "right": sum(row["right"] for row in judged),
+            "wrong": sum(not row["right"] for row in judged),
+            "truth_lost": sum(row["kind"] == RIGHT and not row["right"] for row in judged),
+        },
+        "figures": figures,
+        "verdicts_by_kind": {
+            kind: _verdicts([row for row in judged if row["kind"] == kind]) for kind in kinds
+        },
+        "verdicts_by_sensor": {
+            sensor: {
+                word: _verdicts(
+                    [r for r in judged if r["sensor"] == sensor and r["right"] is right]
+                )
+                for word, right in (("right", True), ("wrong", False))
+            }
+            for sensor in sensors
+        },
+        "register": {
+            sensor: _outcomes([row for row in runs if row["sensor"] == sensor])
+            for sensor in dict.fromkeys(row["sensor"] for row in runs)
+        },
+        "judged": list(judged),
+        "registered": list(runs),
+    }
+
+
+def _verdicts(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Counts of the verdicts, with rivals and alone."""
+    count = Counter(row["verdict"] for row in rows)
+    alone = Counter(row["verdict_alone"] for row in rows)
+    return {status: count[status] for status in STATUSES} | {"accepted_alone": alone["accepted"]}
+
+
+def _outcomes(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """What became of the registrations of one sensor."""
+    count = Counter((row["verdict"], row["right"]) for row in rows)
+    lists = [row for row in rows if row["verdict"] == "ambiguous"]
+    return {
+        "accepted_right": count["accepted", True],
+        "accepted_wrong": count["accepted", False],
+        "ambiguous": len(lists),
+        "ambiguous_right_not_given": sum(not (r["right"] or r["right_listed"]) for r in lists),
+        "rejected_right": count["rejected", True],
+        "rejected_wrong": count["rejected", False],
+    }
+
+
+def table(report: Mapping[str, Any]) -> str:
+    """The report as aligned text."""
+    poses = report["poses"]
+    lines = [f"{poses['right']} right and {poses['wrong']} wrong poses", ""]
+    lines.append(f"{'told apart by':<34}{'AUC':>8}{'right accepted at no wrong':>28}")
+    for name, row in report["figures"].items():
+        lines.append(
+            f"  {FIGURES[name]:<32}{row['auc']:>8.4f}{row['true_accepts_at_no_false']:>28.1%}"
+        )
+    head = "".join(f"{status:>11}" for status in (*STATUSES, "(accepted without rivals)"))
+    lines += ["", f"{'pose':<34}{head}"]
+    rows = list(report["verdicts_by_kind"].items())
+    for sensor, words in report["verdicts_by_sensor"].items():
+        rows += [(f"{sensor}, {word}", count) for word, count in words.items()]
+    for name, count in rows:
+        cells = "".join(f"{count[status]:>11}" for status in STATUSES)
+        lines.append(f"  {name:<32}{cells}{count['accepted_alone']:>27}")
+    lines += ["", f"{'register, no guess':<20}" + "".join(f"{s:>13}" for s in report["register"])]
+    outcomes = next(iter(report["register"].values()), {})
+    for outcome in outcomes:
+        cells = "".join(f"{count[outcome]:>13}" for count in report["register"].values())
+        lines.append(f"  {outcome.replace('_', ' '):<26}"[:28].ljust(20) + cells)
+    for row in report["registered"]:
+        if row["verdict"] == "accepted" and not row["right"]:
+            lines.append(
+                f"ACCEPTED AND WRONG: {row['part']}, {row['sensor']}: {row['rotation_deg']:.2f} "
+                f"deg, {row['translation_mm']:.2f} mm"
+            )
+    return "\n".join(lines)
+
+
+def picture(report: Mapping[str, Any]) -> Figure:
+    """The ROC of each figure, and the verdicts by kind of pose."""
+    figure = new_figure(11.0, 4.4)
+    curves, bars = figure.subplots(1, 2)
+    for color, name in zip(SERIES, report["figures"], strict=False):
+        right, wrong = figure_of(report["judged"], name)
+        label = f"{FIGURES[name]}: {report['figures'][name]['auc']:.3f}"
+        curves.step(*roc(right, wrong), where="post", color=color, label=label)
+    curves.plot([0, 1], [0, 1], ":", color=FAINT)
+    curves.legend(frameon=False, fontsize=9, labelcolor=INK, title="area under the curve")
+    style_chart(
+        curves, title="right against wrong poses", xlabel="wrong poses accepted",
+        ylabel="right poses accepted",
+    )  # fmt: skip
+    kinds = report["verdicts_by_kind"]
+    left = np.zeros(len(kinds))
+    totals = np.array([sum(count[s] for s in STATUSES) for count in kinds.values()])
+    names = [f"{kind} ({total})" for kind, total in zip(kinds, totals, strict=True)]
+    for color, status in zip((SERIES[2], SERIES[1], SERIES[5]), STATUSES, strict=True):
+        share = np.array([count[status] for count in kinds.values()]) / np.maximum(totals, 1)
+        bars.barh(names, share, left=left, color=color, label=status)
+        left += share
+    bars.invert_yaxis()
+    style_chart(bars, title="verdict by kind of pose", xlabel="share of the poses")
+    bars.grid(False)
+    figure.legend(
+        *bars.get_legend_handles_labels(), loc="outside upper right", ncols=3, frameon=False,
+        labelcolor=INK,
+    )  # fmt: skip
+    return figure

@@ -1,0 +1,238 @@
+"""How well the verdict tells right poses from wrong ones, over parts and sensors.
+
+python -m experiments.verdicts [--quick] [--scans 1] [--parts NAME,...] [--sensors NAME,...]
+
+Each part is scanned by each sensor from random rotations. The true pose and wrong ones (one pitch
+off, upside down, nearly symmetric, turned by 10 to 180 deg) are refined, and the part is sought in
+the scan of another one; every pose that results is verified and judged as `vanejax.register` does,
+against the others as rivals. Then `vanejax.register` itself is run from no guess. Results: tables,
+verdicts.json and verdicts.png in ``--out``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from experiments import study
+from experiments.challenge_parts import names_of_parts
+from experiments.verdict_report import OTHER_PART, RIGHT, picture, summarize, table
+from experiments.wrong_poses import (
+    SENSORS,
+    VANE,
+    PosedScan,
+    parts_to_pose,
+    posed_scan,
+    wrong_starts,
+)
+from vanejax import locate
+from vanejax.errors import InputError
+from vanejax.measured_scan import MIN_POINTS, MeasuredScan
+from vanejax.part import Part
+from vanejax.plotting.canvas import save_figure
+from vanejax.pose_result import Verdict, Verification
+from vanejax.pose_search import concatenate, distances, distinct, is_same, search, select
+from vanejax.refine import refine, subset, uncertainty
+from vanejax.residuals import RayCasting
+from vanejax.rigid import RigidTransform
+from vanejax.scanner import Scanner
+from vanejax.surface import Surface
+from vanejax.verdict import Rival, judge
+from vanejax.verification import View, evidence, verify
+
+QUICK_PARTS = (VANE, "vane_4", "flange_odd_hole", "box", "wedge")
+OTHER_PART_STARTS = 200
+OTHER_PART_POSES = 3
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Assessed:
+    """What is said of one refined pose of a scan.
+
+    Attributes:
+      part_from_camera: the pose.
+      verification: of it.
+      preference: standard errors by which the scan prefers it to its best rival; inf without one.
+      verdict: with the rivals.
+      alone: the verdict as if no other pose were known.
+    """
+
+    part_from_camera: RigidTransform
+    verification: Verification
+    preference: float
+    verdict: Verdict
+    alone: Verdict
+
+
+def make_model(part: Part) -> RayCasting:
+    """Rays from the origin of the scan's frame."""
+    return RayCasting(Scanner(part), Surface(part), np.zeros(3))
+
+
+def assess(
+    model: RayCasting, points: np.ndarray, starts: Sequence[RigidTransform], seed: int = 0
+) -> list[Assessed]:
+    """Refines starts, and verifies and judges each with the others as its rivals.
+
+    The steps, and the numbers of points, are those of `vanejax.locate`. Starts that end at a pose
+    nearer than what counts as the same there are still judged each, but are no rivals.
+    """
+    part = model.part
+    refined = [refine(model, points, start, seed=seed) for start in starts]
+    poses = _batch([found.part_from_camera for found in refined])
+    some = points[subset(points, locate.RIVAL_POINTS, seed + 2)]
+    checked = subset(points, locate.VERIFIED_POINTS, seed + 3)
+    few, all_checked = View(some, model.sensor_origin), View(points[checked], model.sensor_origin)
+    result = []
+    for found in refined:
+        pose = found.part_from_camera
+        tolerance = float(locate._tolerance(model, _batch([pose]), some)[0])
+        turn, shift = distances(poses, pose, part)
+        others = np.flatnonzero(~is_same(turn, shift, part))
+        compared = concatenate(_batch([pose]), select(poses, others))
+        said = evidence(model, compared, some, tolerance_mm=tolerance, view=few)
+        rivals = [
+            Rival(said.preference(0, 1 + n), float(turn[o]), float(shift[o]), select(poses, o))
+            for n, o in enumerate(others)
+        ]
+        seen = verify(model, pose, points, checked, tolerance_mm=tolerance, view=all_checked)
+        sure = uncertainty(found, part.center)
+        with_rivals, alone = (
+            judge(found, seen, sure, known, radius_mm=part.radius) for known in (rivals, ())
+        )
+        best = min((rival.preference for rival in rivals), default=np.inf)
+        result.append(Assessed(pose, seen, best, with_rivals, alone))
+    return result
+
+
+def judged_poses(scan: PosedScan, model: RayCasting, seed: int) -> Iterator[dict[str, Any]]:
+    """A row for the true pose and for each distinct wrong pose to which a start led."""
+    rng = np.random.default_rng([seed, *scan.name.encode()])
+    kinds, starts = zip((RIGHT, scan.truth), *wrong_starts(scan, rng), strict=True)
+    found = assess(model, scan.points, starts, seed)
+    poses = _batch([one.part_from_camera for one in found])
+    wrong = np.array([not scan.is_right(one.part_from_camera) for one in found])
+    wrong[0] = True  # stays in, whether right or lost
+    kept = np.flatnonzero(wrong)
+    for k in kept[distinct(select(poses, kept), model.part, len(kept))]:
+        yield _row(scan, kinds[k], found[k], right=scan.is_right(found[k].part_from_camera))
+
+
+def other_part(scan: PosedScan, model: RayCasting, seed: int) -> dict[str, Any]:
+    """A row for the best pose that a part finds in the scan of another one."""
+    found = search(model, scan.points, count=OTHER_PART_STARTS, seed=seed)
+    starts = [found.pose(k) for k in range(min(len(found), OTHER_PART_POSES))]
+    return _row(scan, OTHER_PART, assess(model, scan.points, starts, seed)[0], right=False)
+
+
+def registered(scan: PosedScan, seed: int) -> dict[str, Any]:
+    """A row for what `vanejax.register` says from no guess."""
+    began = time.perf_counter()
+    measured = MeasuredScan(scan.points, None, np.zeros(3), scan.name)
+    result = locate.register(measured, scan.challenge.part, seed=seed)
+    seconds = time.perf_counter() - began
+    angle, shift = scan.error(result.part_from_camera)
+    return {
+        "part": scan.name,
+        "sensor": scan.sensor,
+        "right": scan.is_right(result.part_from_camera),
+        "right_listed": any(scan.is_right(a.part_from_camera) for a in result.alternatives),
+        "rotation_deg": angle,
+        "translation_mm": shift,
+        "verdict": result.verdict.status,
+        "reason": result.verdict.reason,
+        "seconds": seconds,
+    }
+
+
+def _row(scan: PosedScan, kind: str, found: Assessed, *, right: bool) -> dict[str, Any]:
+    angle, shift = (np.nan, np.nan) if kind == OTHER_PART else scan.error(found.part_from_camera)
+    seen = found.verification
+    return {
+        "part": scan.name,
+        "sensor": scan.sensor,
+        "kind": kind,
+        "right": right,
+        "rotation_deg": angle,
+        "translation_mm": shift,
+        "score": seen.score,
+        "inlier_share": seen.inlier_share,
+        "violation_share": seen.violation_share,
+        "unmeasured_share": seen.unmeasured_share,
+        "preference": found.preference,
+        "tolerance_mm": seen.tolerance_mm,
+        "verdict": found.verdict.status,
+        "verdict_alone": found.alone.status,
+        "reason": found.verdict.reason,
+    }
+
+
+def measure(settings: argparse.Namespace) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """All poses judged, and all registrations."""
+    unknown = sorted(set(settings.sensors) - set(SENSORS))
+    if unknown:
+        raise InputError(f"no sensor {', '.join(unknown)}; there are {', '.join(SENSORS)}")
+    names = QUICK_PARTS if settings.quick else (VANE, *names_of_parts())
+    parts = parts_to_pose(settings.parts or names)
+    judged, runs = [], []
+    bar = tqdm(total=len(parts) * len(settings.sensors) * settings.scans, unit="scan")
+    before: list[PosedScan] = []
+    for name, challenge in parts.items():
+        model = make_model(challenge.part)
+        here = [
+            posed_scan(name, challenge, model.scanner, sensor, settings.seed + number)
+            for sensor in settings.sensors
+            for number in range(settings.scans)
+        ]
+        for scan in here:
+            bar.set_description(f"{name}, {scan.sensor}")
+            if len(scan.points) >= 2 * MIN_POINTS:
+                judged += judged_poses(scan, model, settings.seed)
+                runs.append(registered(scan, settings.seed))
+            bar.update()
+        # the scans of the part before this one
+        judged += [other_part(scan, model, settings.seed) for scan in before]
+        before = here
+    bar.close()
+    return judged, runs
+
+
+def _batch(poses: Sequence[RigidTransform]) -> RigidTransform:
+    return RigidTransform(
+        np.stack([pose.rotation for pose in poses]), np.stack([pose.translation for pose in poses])
+    )
+
+
+def main(settings: argparse.Namespace) -> dict[str, Any]:
+    """The study."""
+    judged, runs = measure(settings)
+    method = "poses judged by ray casting"
+    summary = summarize(judged, runs)
+    report = study.save(settings.out, "verdicts", study.header(method, settings) | summary)
+    save_figure(picture(summary), settings.out / "verdicts.png")
+    print(table(summary))
+    return report
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's arguments."""
+    parser = study.make_parser("verdicts", __doc__)
+    parser.add_argument("--quick", action="store_true", help=f"of {', '.join(QUICK_PARTS)} only")
+    parser.add_argument("--scans", type=study.count, default=1, help="per part and sensor (1)")
+    parser.add_argument("--parts", type=_names, default=None, help="instead of all")
+    parser.add_argument("--sensors", type=_names, default=list(SENSORS), help="instead of all")
+    return parser
+
+
+def _names(text: str) -> list[str]:
+    return text.split(",")
+
+
+if __name__ == "__main__":
+    study.run(main, make_parser())

@@ -1,0 +1,236 @@
+"""Poses from a network: the icosahedral starts, and the way between millimetres and unit sphere."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from example_scans import (
+    batch,
+    disturbed,
+    exact_points,
+    ideal_scan,
+    motion,
+    random_view,
+    vane,
+)
+from scipy.spatial.transform import Rotation
+
+from vanejax import matched_poses
+from vanejax.camera import Camera
+from vanejax.matched_poses import icosahedral_rotations, match_poses
+from vanejax.measured_scan import clean_scan
+from vanejax.model_file import TrainedMatcher
+from vanejax.models.rpmnet import RpmNet
+from vanejax.pairs import Drawing
+from vanejax.pointcloud import PointCloud, voxel_thin
+from vanejax.rigid import RigidTransform
+
+MODEL = RpmNet(num_neighbors=8, radius=0.5, sinkhorn_iterations=2, feature_width=8)
+
+
+def _matcher(voxel_mm: float = 4.0) -> TrainedMatcher:
+    """A network of random weights for the vane, as `vanejax export` would describe it."""
+    part = vane()
+    points, normals, _ = part.sample(8000, seed=0)
+    thinned = voxel_thin(points, voxel_mm=voxel_mm)
+    drawing = Drawing(num_reference=128, num_source=96)
+    cloud = PointCloud.create(
+        np.zeros((drawing.num_reference, 3), np.float32),
+        np.tile(np.float32([0, 0, 1]), (drawing.num_reference, 1)),
+    )
+    variables = MODEL.init(
+        jax.random.key(0), cloud, cloud, RigidTransform.identity(dtype=np.float32), 1
+    )
+    return TrainedMatcher(
+        model=MODEL,
+        variables=jax.tree.map(np.asarray, variables),
+        iterations=2,
+        drawing=drawing,
+        voxel_mm=voxel_mm,
+        center=part.center,
+        radius_mm=part.radius,
+        reference_points=points[thinned].astype(np.float32),
+        reference_normals=normals[thinned].astype(np.float32),
+        part_name=part.name,
+        part_sha256=part.sha256,
+        camera=Camera(),
+    )
+
+
+@pytest.fixture(scope="module")
+def matcher() -> TrainedMatcher:
+    return _matcher()
+
+
+@pytest.fixture(scope="module")
+def scan():
+    ideal, truth = ideal_scan(vane())
+    return clean_scan(exact_points(vane(), ideal)), truth
+
+
+def guesses(truth: RigidTransform, count: int = 3) -> RigidTransform:
+    return batch(*(disturbed(vane(), truth, 10 + k, 3, seed=k) for k in range(count)))
+
+
+def same_as(model: RpmNet, variables, source, target, inits, features=None) -> RigidTransform:
+    """A network that finds nothing to do."""
+    del model, variables, source, target, features
+    return inits
+
+
+# --- the icosahedron ----------------------------------------------------------------------------
+
+
+def test_the_60_rotations_are_a_group():
+    group = icosahedral_rotations()
+    assert group.shape == (60, 3, 3)
+    np.testing.assert_allclose(np.linalg.det(group), 1, atol=1e-12)
+    products = np.einsum("aij,bjk->abik", group, group).reshape(-1, 9)
+    distance = np.linalg.norm(products[:, None] - group.reshape(1, 60, 9), axis=-1)
+    assert distance.min(axis=1).max() < 1e-12
+    assert len(np.unique(np.round(group.reshape(60, 9), 6), axis=0)) == 60
+
+
+def test_every_rotation_is_within_44_5_deg_of_one():
+    probes = Rotation.random(20_000, random_state=0).as_matrix()
+    trace = np.einsum("aij,bij->ab", probes, icosahedral_rotations()).max(axis=1)
+    nearest = np.degrees(np.arccos((trace - 1) / 2))
+    assert nearest.max() < 44.5  # the covering radius is 44.48 deg
+    assert nearest.max() > 41  # and 20,000 of them come near it
+
+
+# --- units and frames ---------------------------------------------------------------------------
+
+
+def test_a_network_that_changes_nothing_gives_the_guess_back(matcher, scan, monkeypatch):
+    """Into the unit sphere and out again; float32 holds 1e-7 of 400 mm, twice."""
+    monkeypatch.setattr(matched_poses, "_follow", lambda model, n, *rest: same_as(model, *rest))
+    measured, truth = scan
+    asked = guesses(truth)
+    found = match_poses(matcher, measured, asked, iterations=1)
+    np.testing.assert_allclose(found.rotation, asked.rotation, atol=1e-6)
+    np.testing.assert_allclose(found.translation, asked.translation, atol=1e-3)
+
+
+def test_at_the_true_pose_the_clouds_that_the_network_sees_lie_on_each_other(
+    matcher, scan, monkeypatch
+):
+    seen = {}
+
+    def look(model, iterations, variables, source, target, inits):
+        seen.update(source=source, target=target, inits=inits)
+        return inits
+
+    monkeypatch.setattr(matched_poses, "_follow", look)
+    measured, truth = scan
+    match_poses(matcher, measured, batch(truth), iterations=1)
+    source, target, inits = seen["source"], seen["target"], seen["inits"]
+    rotation, translation = np.asarray(inits.rotation)[0], np.asarray(inits.translation)[0]
+    mask = np.asarray(source.mask)
+    there = np.asarray(source.xyz)[mask] @ rotation.T + translation
+    reference = np.asarray(target.xyz)
+    assert np.linalg.norm(reference, axis=1).max() <= 1 + 1e-6  # the unit sphere
+    assert np.linalg.norm(there, axis=1).max() <= 1 + 1e-4
+    # every scan point has a reference point near: 128 of them on the surface, 0.15 apart
+    gap = np.linalg.norm(there[:, None] - reference[None], axis=-1).min(axis=1)
+    assert np.mean(gap) < 0.15
+    normals = np.asarray(source.normals)[mask]
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
+    assert not np.asarray(source.xyz)[~mask].any()
+    # as in training: num_reference X / Y of the X thinned points
+    thinned = len(voxel_thin(measured.points, voxel_mm=matcher.voxel_mm))
+    wanted = round(128 * thinned / len(matcher.reference_points))
+    assert mask.sum() == np.clip(wanted, 16, 96)
+
+
+def test_normals_of_the_scan_are_used_and_turned_to_the_sensor(matcher, scan, monkeypatch):
+    seen = {}
+
+    def look(model, iterations, variables, source, target, inits):
+        seen.update(source=source)
+        return inits
+
+    monkeypatch.setattr(matched_poses, "_follow", look)
+    measured, truth = scan
+    ideal, _ = ideal_scan(vane())
+    # marked, so that they are known again
+    marked = np.zeros((len(measured.points), 3), np.float32)
+    marked[:, 2] = 1
+    given = clean_scan(measured.points, marked)
+    match_poses(matcher, given, batch(truth), iterations=1)
+    normals = np.asarray(seen["source"].normals)[np.asarray(seen["source"].mask)]
+    np.testing.assert_array_equal(normals, np.broadcast_to([0, 0, 1], normals.shape))
+    match_poses(matcher, measured, batch(truth), iterations=1)
+    estimated = np.asarray(seen["source"].normals)[np.asarray(seen["source"].mask)]
+    assert (estimated[:, 2] > 0).mean() > 0.9  # the camera looks along -z
+    assert len(ideal.points) >= len(measured.points)
+
+
+# --- the network itself -------------------------------------------------------------------------
+
+
+def test_an_untrained_network_gives_rigid_finite_poses(matcher, scan):
+    measured, truth = scan
+    found = match_poses(matcher, measured, guesses(truth, 5), iterations=2)
+    assert found.rotation.shape == (5, 3, 3)
+    assert found.translation.shape == (5, 3)
+    assert found.rotation.dtype == np.float64
+    assert np.isfinite(found.translation).all()
+    for rotation in found.rotation:
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) == pytest.approx(1)
+    again = match_poses(matcher, measured, guesses(truth, 5), iterations=2)
+    np.testing.assert_array_equal(found.rotation, again.rotation)
+    # it moved them: the network was asked
+    assert not np.allclose(found.rotation, guesses(truth, 5).rotation, atol=1e-3)
+
+
+def test_more_guesses_change_none_of_the_others(matcher, scan):
+    measured, truth = scan
+    many = match_poses(matcher, measured, guesses(truth, 6), iterations=1)
+    one = match_poses(matcher, measured, guesses(truth, 1), iterations=1)
+    np.testing.assert_allclose(many.rotation[0], one.rotation[0], atol=1e-5)
+    np.testing.assert_allclose(many.translation[0], one.translation[0], atol=0.01)
+
+
+def test_the_place_of_the_scan_does_not_matter(matcher, scan):
+    """The scan shifted and the guess against it: the same points of the part, the same answer."""
+    measured, truth = scan
+    asked = guesses(truth)
+    shift = RigidTransform(np.eye(3), np.array([64.0, -128.0, 32.0]))  # whole voxels of 4 mm
+    away = dataclasses.replace(
+        measured,
+        points=shift.apply(measured.points),
+        sensor_origin=measured.sensor_origin + shift.translation,
+    )
+    moved = RigidTransform(asked.rotation, asked.translation - asked.rotation @ shift.translation)
+    here = match_poses(matcher, measured, asked, iterations=1)
+    there = match_poses(matcher, away, moved, iterations=1)
+    back = there.translation + there.rotation @ shift.translation
+    np.testing.assert_allclose(there.rotation, here.rotation, atol=1e-4)
+    np.testing.assert_allclose(back, here.translation, atol=0.02)
+
+
+def test_weights_of_nan_give_the_guess_back(matcher, scan):
+    measured, truth = scan
+    broken = dataclasses.replace(
+        matcher, variables=jax.tree.map(lambda x: np.full_like(x, np.nan), matcher.variables)
+    )
+    asked = guesses(truth)
+    found = match_poses(broken, measured, asked, iterations=1)
+    np.testing.assert_array_equal(found.rotation, asked.rotation)
+    np.testing.assert_array_equal(found.translation, asked.translation)
+
+
+def test_a_scan_without_a_sensor_or_with_few_points_is_matched_too(matcher):
+    ideal, truth = ideal_scan(vane(), random_view(vane(), seed=1))
+    some = ideal.points[:: len(ideal.points) // 60].astype(np.float64)
+    frame = motion(vane(), [0, 0, 0], [5, 5, 5])
+    for origin in ("auto", "unknown"):
+        few = clean_scan(frame.apply(some), sensor_origin=origin)
+        found = match_poses(matcher, few, batch(truth), iterations=1)
+        assert np.isfinite(found.rotation).all()
+        assert np.isfinite(found.translation).all()

@@ -1,0 +1,425 @@
+"""Fine registration against the Cramer-Rao bound of the same rays, and what it says of itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from example_scans import (
+    MIDDLE,
+    SMALL,
+    batch,
+    box,
+    disturbed,
+    exact_points,
+    ideal_scan,
+    measured_points,
+    model,
+    motion,
+    pose_error,
+    small_motion,
+    vane,
+    with_noise,
+)
+from scipy.stats import chi2
+
+from vanejax.camera import look_at
+from vanejax.part import Part
+from vanejax.refine import descend, fit_noise, refine, subset, uncertainty
+from vanejax.residuals import RayCasting, Residuals, SurfaceMatching
+from vanejax.rigid import RigidTransform
+
+CERTAIN = chi2.ppf(0.9999, 6)  # 27.9: one right draw in 10,000 is farther off
+
+
+def true_information(
+    part: Part, points: np.ndarray, truth: RigidTransform, noise_mm: float
+) -> np.ndarray:
+    """[6, 6] inverse of the Cramer-Rao bound for white noise along these rays, at the true pose.
+
+    A ray of direction d that meets a face of normal n at x changes its range by
+    ``((x - c) x n . omega + n . v) / (n . d)``. Rays flatter than 88.9 deg are left out: they hold
+    in the limit of no noise only.
+    """
+    range_mm = np.linalg.norm(points, axis=1, keepdims=True)
+    direction = truth.rotate(points / range_mm)
+    sensor = np.broadcast_to(truth.translation, points.shape)
+    hits = model(part).scanner.cast(sensor, direction)
+    closing = np.einsum("ni,ni->n", hits.normals, direction)
+    met = (hits.face >= 0) & (closing < -0.02)
+    x = sensor + np.where(met, hits.distance_mm, 0)[:, None] * direction - part.center
+    row = np.concatenate([np.cross(x, hits.normals), hits.normals], axis=1)
+    row = row[met] / closing[met, None]
+    return row.T @ row / noise_mm**2
+
+
+def squared_error(part: Part, found: RigidTransform, truth: RigidTransform, information) -> float:
+    """In standard deviations: chi-square with six degrees of freedom for a bound that is met."""
+    e = small_motion(part, found, truth)
+    return float(e @ information @ e)
+
+
+@pytest.fixture(scope="module")
+def exact() -> tuple[np.ndarray, RigidTransform]:
+    """2,300 points without noise, and the true part_from_camera."""
+    scan, truth = ideal_scan(vane())
+    return exact_points(vane(), scan), truth
+
+
+@pytest.fixture(scope="module")
+def fine() -> tuple[np.ndarray, RigidTransform]:
+    """14,000 points without noise, and the true part_from_camera."""
+    scan, truth = ideal_scan(vane(), camera=MIDDLE)
+    return exact_points(vane(), scan), truth
+
+
+# --- where it ends ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_from_5_deg_and_5_mm_it_ends_at_the_bound(exact, seed):
+    points, truth = exact
+    points = with_noise(points, 0.1, seed)
+    found = refine(model(vane()), points, disturbed(vane(), truth, 5, 5, seed))
+    bound = true_information(vane(), points, truth, 0.1)
+    assert squared_error(vane(), found.part_from_camera, truth, bound) < CERTAIN
+    assert found.method == "ray casting"
+    assert found.num_points == len(points)
+    assert 0.99 * len(points) <= found.num_inliers <= len(points)
+    assert 3 <= found.iterations < 60
+
+
+@pytest.mark.parametrize("noise_mm", [0.05, 0.1, 0.5, 1.0])
+def test_the_error_is_the_bounds_and_no_draw_is_far_off(exact, noise_mm):
+    """Twenty draws of noise; seed 18 at 0.1 mm once kept a ray that had slipped off its face."""
+    points, truth = exact
+    bound = true_information(vane(), points, truth, noise_mm)
+    errors = []
+    for seed in range(20):
+        noisy = with_noise(points, noise_mm, seed)
+        found = refine(model(vane()), noisy, disturbed(vane(), truth, 5, 5, seed))
+        errors.append(squared_error(vane(), found.part_from_camera, truth, bound))
+    assert max(errors) < CERTAIN
+    # the mean over 20 draws of six: chi-square with 120 degrees of freedom, one in 1,000
+    assert np.mean(errors) < 1.2 * chi2.ppf(0.999, 120) / 20
+
+
+def test_a_scan_without_noise_gives_the_pose_itself(fine):
+    points, truth = fine
+    found = refine(model(vane()), points, disturbed(vane(), truth, 5, 5, seed=1))
+    angle, shift = pose_error(vane(), found.part_from_camera, truth)
+    assert angle < 1e-4
+    assert shift < 1e-4
+    assert found.converged
+
+
+def test_it_stops_by_itself(fine):
+    points, truth = fine
+    points = with_noise(points, 0.1, 3)
+    found = refine(model(vane()), points, disturbed(vane(), truth, 5, 5, seed=3))
+    again = refine(model(vane()), points, found.part_from_camera)
+    assert found.converged
+    assert again.converged
+    assert again.iterations < 12
+    # where it started does not matter: the rest is a tenth of a standard deviation
+    between = small_motion(vane(), again.part_from_camera, found.part_from_camera)
+    assert between @ found.information @ between < 0.06
+
+
+def test_a_motion_of_the_scan_moves_the_answer(exact):
+    points, truth = exact
+    points = with_noise(points, 0.1, 0)
+    init = disturbed(vane(), truth, 3, 3, seed=4)
+    found = refine(model(vane()), points, init)
+    other = motion(box(), [40, -100, 70], [300, -200, 100])  # other frame from camera
+    away = RayCasting(model(vane()).scanner, model(vane()).surface, other.translation)
+    moved = refine(away, other.apply(points), init @ other.inverse())
+    back = moved.part_from_camera @ other
+    between = small_motion(vane(), back, found.part_from_camera)
+    # rounding of 1e-13 of a coordinate may make a ray at an edge change its face
+    assert between @ found.information @ between < 0.06
+    np.testing.assert_allclose(moved.information, found.information, rtol=0.02, atol=1)
+
+
+def test_the_same_call_gives_the_same_bits(exact):
+    points, truth = exact
+    points = with_noise(points, 0.5, 0)
+    init = disturbed(vane(), truth, 3, 3, seed=4)
+    one, two = (refine(model(vane()), points, init, seed=5) for _ in range(2))
+    np.testing.assert_array_equal(one.part_from_camera.rotation, two.part_from_camera.rotation)
+    np.testing.assert_array_equal(
+        one.part_from_camera.translation, two.part_from_camera.translation
+    )
+    np.testing.assert_array_equal(one.information, two.information)
+
+
+# --- scans that are worse than white noise ------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ten_percent_of_gross_outliers(exact, seed):
+    points, truth = exact
+    points = with_noise(points, 0.1, seed)
+    rng = np.random.default_rng(seed)
+    lost = rng.random(len(points)) < 0.1
+    points[lost] *= rng.uniform(0.9, 1.1, (lost.sum(), 1))  # up to 40 mm off along the ray
+    found = refine(model(vane()), points, disturbed(vane(), truth, 5, 5, seed))
+    bound = true_information(vane(), points[~lost], truth, 0.1)
+    # outliers within five standard deviations stay: 1 % of them
+    assert squared_error(vane(), found.part_from_camera, truth, bound) < 2 * CERTAIN
+    assert found.noise_mm == pytest.approx(0.1, rel=0.2)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_missing_third(exact, axis):
+    points, truth = exact
+    points = with_noise(points, 0.1, 1)
+    kept = points[points[:, axis] > np.quantile(points[:, axis], 1 / 3)]
+    found = refine(model(vane()), kept, disturbed(vane(), truth, 5, 5, seed=axis))
+    bound = true_information(vane(), kept, truth, 0.1)
+    assert squared_error(vane(), found.part_from_camera, truth, bound) < CERTAIN
+
+
+def test_a_full_scan_thinned_to_2000_points(fine):
+    points, truth = fine
+    points = with_noise(points, 0.1, 2)
+    points = points[subset(points, 2000, seed=0)]
+    found = refine(model(vane()), points, disturbed(vane(), truth, 5, 5, seed=2))
+    bound = true_information(vane(), points, truth, 0.1)
+    assert squared_error(vane(), found.part_from_camera, truth, bound) < CERTAIN
+    assert found.num_points == 2000
+
+
+def test_clutter_beside_the_part(exact):
+    """A plate behind the part and beside it, a quarter of all points."""
+    points, truth = exact
+    points = with_noise(points, 0.1, 4)
+    rng = np.random.default_rng(0)
+    plate = np.stack([rng.uniform(-90, 90, 1500), rng.uniform(-70, 70, 1500), np.full(1500, -460)])
+    beside = np.abs(plate[1]) > 55
+    cluttered = np.concatenate([points, plate.T[beside]])
+    found = refine(model(vane()), cluttered, disturbed(vane(), truth, 5, 5, seed=2))
+    bound = true_information(vane(), points, truth, 0.1)
+    assert beside.sum() > 250
+    assert squared_error(vane(), found.part_from_camera, truth, bound) < 2 * CERTAIN
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_without_a_sensor_it_falls_back_to_point_to_plane(fine, seed):
+    points, truth = fine
+    points = with_noise(points, 0.1, seed)
+    measured = SurfaceMatching(model(vane()).surface, reach_mm=20.0)
+    other = motion(box(), [40, -100, 70], [300, -200, 100])  # other frame from camera
+    init = disturbed(vane(), truth, 2, 2, seed) @ other.inverse()
+    found = refine(measured, other.apply(points), init)
+    angle, shift = pose_error(vane(), found.part_from_camera @ other, truth)
+    # five times the bound: matches at edges are to the wrong face by now and then
+    assert angle < 0.02
+    assert shift < 0.02
+    assert found.method == "point to plane"
+    assert found.converged
+    # along the normal, not along the ray: 0.1 mm x the mean cosine of some 0.5
+    assert 0.03 < found.noise_mm < 0.1
+
+
+def test_a_plane_leaves_three_directions_open():
+    """A scan of one face only: what it holds is found, what it does not hold stays as it was."""
+    part = box()
+    view = look_at(part.center + np.array([0.0, 0.0, 400.0]), part.center)
+    points, truth = measured_points(part, view, noise_mm=0.05)
+    inner = np.all(np.abs(truth.apply(points)[:, :2] - part.center[:2]) < [25, 12], axis=1)
+    init = motion(part, [0.5, -0.5, 0.0], [0.0, 0.0, 1.0]) @ truth
+    found = refine(model(part), points[inner], init)
+    e = small_motion(part, found.part_from_camera, truth)
+    assert np.abs(np.degrees(e[:2])).max() < 0.05
+    assert abs(e[5]) < 0.02
+    assert not found.converged  # six directions were asked for
+    sure = uncertainty(found, part.center)
+    assert sure.weakest_rotation_sigma_deg > 10
+    assert abs(sure.weakest_rotation_axis[2]) > 0.99
+    assert sure.weakest_translation_sigma_mm > 10
+    assert abs(sure.weakest_translation_axis[2]) < 0.1
+
+
+@pytest.mark.parametrize("turn_deg", [60, 90, 180])
+def test_from_far_away_the_residuals_tell(exact, turn_deg):
+    points, truth = exact
+    points = with_noise(points, 0.1, 0)
+    init = motion(vane(), turn_deg * np.array([0.0, 0.6, 0.8]), np.zeros(3)) @ truth
+    found = refine(model(vane()), points, init)
+    angle, _ = pose_error(vane(), found.part_from_camera, truth)
+    assert np.isfinite(found.part_from_camera.rotation).all()
+    if angle > 1:  # else it came home after all
+        good = found.noise_mm < 0.3 and found.num_inliers > 0.9 * len(points)
+        assert not good
+
+
+# --- descend ------------------------------------------------------------------------------------
+
+
+def test_descend_takes_each_pose_of_a_batch_home(exact):
+    points, truth = exact
+    starts = [disturbed(vane(), truth, 10, 5, seed) for seed in range(4)]
+    found, iterations = descend(model(vane()), batch(*starts), points, iterations=20)
+    alone, _ = descend(model(vane()), batch(starts[2]), points, iterations=20)
+    assert iterations == 20
+    for k in range(4):
+        pose = RigidTransform(found.rotation[k], found.translation[k])
+        assert max(pose_error(vane(), pose, truth)) < 0.2
+    np.testing.assert_allclose(found.rotation[2], alone.rotation[0], atol=1e-9)
+
+
+def test_descend_stops_where_nothing_moves(exact):
+    points, truth = exact
+    _, iterations = descend(model(vane()), batch(truth), points, iterations=20, settled_deg=0.1)
+    assert iterations == 1
+
+
+# --- what it says of itself ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise_mm", [0.05, 0.1, 0.5, 1.0])
+def test_the_noise_is_reported(fine, noise_mm):
+    points, truth = fine
+    noisy = with_noise(points, noise_mm, 0)
+    found = refine(model(vane()), noisy, disturbed(vane(), truth, 2, 2, seed=0))
+    # 14,000 points give 0.6 %; the split between range and lateral noise costs some of it
+    assert found.noise_mm == pytest.approx(noise_mm, rel=0.05)
+
+
+def test_the_information_is_the_bounds(fine):
+    points, truth = fine
+    noisy = with_noise(points, 0.1, 1)
+    found = refine(model(vane()), noisy, disturbed(vane(), truth, 2, 2, seed=0))
+    bound = true_information(vane(), points, truth, 0.1)
+    ratio = np.linalg.eigvals(np.linalg.solve(bound, found.information)).real
+    assert ratio.min() > 0.75
+    assert ratio.max() < 1.1
+
+
+def test_the_covariance_covers_the_errors(exact):
+    """Normalised squared errors of 30 draws: their sum is chi-square with 180 degrees."""
+    points, truth = exact
+    errors = []
+    for seed in range(30):
+        noisy = with_noise(points, 0.2, 100 + seed)
+        found = refine(model(vane()), noisy, disturbed(vane(), truth, 2, 2, seed))
+        errors.append(squared_error(vane(), found.part_from_camera, truth, found.information))
+    low, high = chi2.ppf([0.001, 0.999], 180)
+    assert low < np.sum(errors) < 1.15 * high  # 1.15: the noise itself is estimated
+    assert max(errors) < CERTAIN
+
+
+def test_errors_that_go_together_widen_the_covariance(fine):
+    """A smooth error field of 0.1 mm under 0.05 mm of white noise: the patches' scores show it."""
+    points, truth = fine
+    white = with_noise(points, 0.05, 2)
+    init = disturbed(vane(), truth, 1, 1, seed=0)
+    plain = refine(model(vane()), white, init)
+    angle = points[:, :2] / np.ptp(points[:, :2], axis=0).max() * 2 * np.pi
+    along = np.linalg.norm(points, axis=1, keepdims=True)
+    ratio, errors = [], []
+    for phase in range(4):
+        wave = np.sin(2 * angle[:, 0] + phase) * np.cos(2 * angle[:, 1] + 2 * phase)
+        bent = white * (1 + 0.1 * np.sqrt(2) * wave[:, None] / along)
+        found = refine(model(vane()), bent, init)
+        errors.append(squared_error(vane(), found.part_from_camera, truth, found.information))
+        grown = np.linalg.solve(found.information, plain.information)
+        ratio.append(np.median(np.linalg.eigvals(grown).real))
+    # variance of one ray: 0.0025 + 0.01, five times; more than that is the correlation
+    assert min(ratio) > 10
+    # white noise's covariance alone would give hundreds
+    assert np.mean(errors) < 4 * 6
+
+
+def residuals(along: np.ndarray, cosine: np.ndarray) -> Residuals:
+    """Of one pose, every ray a hit."""
+    return Residuals(
+        deviation_mm=(along * cosine)[None],
+        jacobian=np.zeros((1, len(along), 6)),
+        cosine=cosine[None],
+        hit=np.ones((1, len(along)), bool),
+    )
+
+
+@pytest.mark.parametrize(
+    ("range_mm", "lateral_mm"), [(0.1, 0.0), (0.1, 0.1), (0.05, 0.2), (0.5, 0.3)]
+)
+def test_range_and_lateral_noise_are_told_apart(range_mm, lateral_mm):
+    rng = np.random.default_rng(0)
+    cosine = np.cos(np.radians(rng.uniform(5, 80, 20_000)))
+    sigma = np.hypot(range_mm, lateral_mm * np.sqrt(1 / cosine**2 - 1))
+    noise = fit_noise(residuals(sigma * rng.normal(size=len(cosine)), cosine))
+    # a median of 1,700 is good to 3 %, and the two follow from twelve of them
+    assert noise.range_mm == pytest.approx(range_mm, rel=0.15)
+    assert noise.lateral_mm == pytest.approx(lateral_mm, rel=0.15, abs=0.15 * range_mm)
+    assert np.isinf(noise.degrees_of_freedom)
+    np.testing.assert_allclose(noise.sigma_mm(cosine), sigma, rtol=0.15)
+
+
+@pytest.mark.parametrize("freedom", [2.0, 4.0, np.inf])
+def test_the_tails_are_found(freedom):
+    rng = np.random.default_rng(1)
+    cosine = np.cos(np.radians(rng.uniform(5, 60, 20_000)))
+    size = len(cosine)
+    draws = rng.normal(size=size) if np.isinf(freedom) else rng.standard_t(freedom, size)
+    noise = fit_noise(residuals(0.2 * draws, cosine))
+    near = {2.0: (1.5, 2, 3), 4.0: (3, 4, 6), np.inf: (np.inf,)}[freedom]
+    assert noise.degrees_of_freedom in near
+    assert noise.range_mm == pytest.approx(0.2, rel=0.15)  # of the t's core, not of all
+
+
+def test_gross_errors_do_not_pass_for_noise():
+    rng = np.random.default_rng(2)
+    cosine = np.cos(np.radians(rng.uniform(5, 60, 5_000)))
+    along = 0.1 * rng.normal(size=len(cosine))
+    along[::10] = rng.uniform(-30, 30, len(along[::10]))
+    noise = fit_noise(residuals(along, cosine))
+    assert noise.range_mm == pytest.approx(0.1, rel=0.25)
+
+
+def test_no_noise_and_few_points_are_no_trouble():
+    for count in (5, 29, 200):
+        noise = fit_noise(residuals(np.zeros(count), np.full(count, 0.7)))
+        assert 0 < noise.range_mm < 1e-5
+        assert noise.lateral_mm == 0
+
+
+def test_uncertainty_reads_the_covariance():
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(6, 6)) * np.repeat([1e-4, 1e-2], 3)[:, None]
+    covariance = root @ root.T
+    found = refine(*_ideal_call())
+    fields = dict(vars(found), information=np.linalg.inv(covariance))
+    sure = uncertainty(type(found)(**fields), [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(sure.covariance, covariance, rtol=1e-6, atol=1e-14)
+    sigma = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(sure.rotation_sigma_deg, np.degrees(sigma[:3]), rtol=1e-6)
+    np.testing.assert_allclose(sure.translation_sigma_mm, sigma[3:], rtol=1e-6)
+    axis = sure.weakest_rotation_axis
+    largest = np.degrees(np.sqrt(axis @ covariance[:3, :3] @ axis))
+    assert sure.weakest_rotation_sigma_deg == pytest.approx(largest)
+    assert largest >= sure.rotation_sigma_deg.max() - 1e-12
+    axis = sure.weakest_translation_axis
+    largest = np.sqrt(axis @ covariance[3:, 3:] @ axis)
+    assert sure.weakest_translation_sigma_mm == pytest.approx(largest)
+    assert axis[np.argmax(np.abs(axis))] > 0
+    np.testing.assert_array_equal(sure.center, [1, 2, 3])
+
+
+def _ideal_call() -> tuple[RayCasting, np.ndarray, RigidTransform]:
+    points, truth = measured_points(box(), look_at([200.0, 150, 300], box().center), camera=SMALL)
+    return model(box()), points, truth
+
+
+# --- subsets ------------------------------------------------------------------------------------
+
+
+def test_a_subset_is_drawn_without_replacement():
+    points = np.zeros((1000, 3))
+    some = subset(points, 100, seed=0)
+    assert len(np.unique(some)) == 100
+    assert (np.diff(some) > 0).all()
+    np.testing.assert_array_equal(some, subset(points, 100, seed=0))
+    assert not np.array_equal(some, subset(points, 100, seed=1))
+    np.testing.assert_array_equal(subset(points, 1000, seed=0), np.arange(1000))
+    np.testing.assert_array_equal(subset(points, 5000, seed=0), np.arange(1000))
