@@ -12,7 +12,6 @@ from example_scans import (
     disturbed,
     exact_points,
     ideal_scan,
-    motion,
     random_view,
     vane,
 )
@@ -39,14 +38,20 @@ def _matcher(voxel_mm: float = 4.0) -> TrainedMatcher:
     drawing = Drawing(num_reference=128, num_source=96)
     cloud = PointCloud.create(
         np.zeros((drawing.num_reference, 3), np.float32),
-        np.tile(np.float32([0, 0, 1]), (drawing.num_reference, 1)),
+        np.zeros((drawing.num_reference, 3), np.float32),
     )
-    variables = MODEL.init(
-        jax.random.key(0), cloud, cloud, RigidTransform.identity(dtype=np.float32), 1
+    shapes = jax.eval_shape(
+        lambda *args: MODEL.init(*args, 1),
+        jax.random.key(0),
+        cloud,
+        cloud,
+        RigidTransform.identity(),
     )
+    rng = np.random.default_rng(0)
+    variables = jax.tree.map(lambda leaf: rng.normal(0, 0.1, leaf.shape).astype(np.float32), shapes)
     return TrainedMatcher(
         model=MODEL,
-        variables=jax.tree.map(np.asarray, variables),
+        variables=variables,
         iterations=2,
         drawing=drawing,
         voxel_mm=voxel_mm,
@@ -71,8 +76,9 @@ def scan():
     return clean_scan(exact_points(vane(), ideal)), truth
 
 
-def guesses(truth: RigidTransform, count: int = 3) -> RigidTransform:
-    return batch(*(disturbed(vane(), truth, 10 + k, 3, seed=k) for k in range(count)))
+def guesses(truth: RigidTransform, first: int = 0) -> RigidTransform:
+    """Four rough poses; always four, for each number of them is compiled anew."""
+    return batch(*(disturbed(vane(), truth, 10 + k, 3, seed=k) for k in range(first, first + 4)))
 
 
 def same_as(model: RpmNet, variables, source, target, inits, features=None) -> RigidTransform:
@@ -174,44 +180,44 @@ def test_normals_of_the_scan_are_used_and_turned_to_the_sensor(matcher, scan, mo
 
 def test_an_untrained_network_gives_rigid_finite_poses(matcher, scan):
     measured, truth = scan
-    found = match_poses(matcher, measured, guesses(truth, 5), iterations=2)
-    assert found.rotation.shape == (5, 3, 3)
-    assert found.translation.shape == (5, 3)
+    found = match_poses(matcher, measured, guesses(truth), iterations=1)
+    assert found.rotation.shape == (4, 3, 3)
+    assert found.translation.shape == (4, 3)
     assert found.rotation.dtype == np.float64
     assert np.isfinite(found.translation).all()
     for rotation in found.rotation:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(rotation) == pytest.approx(1)
-    again = match_poses(matcher, measured, guesses(truth, 5), iterations=2)
+    again = match_poses(matcher, measured, guesses(truth), iterations=1)
     np.testing.assert_array_equal(found.rotation, again.rotation)
     # it moved them: the network was asked
-    assert not np.allclose(found.rotation, guesses(truth, 5).rotation, atol=1e-3)
+    assert not np.allclose(found.rotation, guesses(truth).rotation, atol=1e-3)
 
 
-def test_more_guesses_change_none_of_the_others(matcher, scan):
+def test_a_guess_does_not_depend_on_the_others(matcher, scan):
     measured, truth = scan
-    many = match_poses(matcher, measured, guesses(truth, 6), iterations=1)
-    one = match_poses(matcher, measured, guesses(truth, 1), iterations=1)
-    np.testing.assert_allclose(many.rotation[0], one.rotation[0], atol=1e-5)
-    np.testing.assert_allclose(many.translation[0], one.translation[0], atol=0.01)
+    here = match_poses(matcher, measured, guesses(truth, 0), iterations=1)
+    there = match_poses(matcher, measured, guesses(truth, 2), iterations=1)
+    np.testing.assert_allclose(here.rotation[2:], there.rotation[:2], atol=1e-5)
+    np.testing.assert_allclose(here.translation[2:], there.translation[:2], atol=0.01)
 
 
 def test_the_place_of_the_scan_does_not_matter(matcher, scan):
     """The scan shifted and the guess against it: the same points of the part, the same answer."""
     measured, truth = scan
     asked = guesses(truth)
-    shift = RigidTransform(np.eye(3), np.array([64.0, -128.0, 32.0]))  # whole voxels of 4 mm
+    # sums without rounding, so that ties in thinning stay ties; and whole voxels of 4 mm
+    measured = dataclasses.replace(measured, points=np.round(measured.points * 1024) / 1024)
+    shift = np.array([64.0, -128.0, 32.0])
     away = dataclasses.replace(
-        measured,
-        points=shift.apply(measured.points),
-        sensor_origin=measured.sensor_origin + shift.translation,
+        measured, points=measured.points + shift, sensor_origin=measured.sensor_origin + shift
     )
-    moved = RigidTransform(asked.rotation, asked.translation - asked.rotation @ shift.translation)
+    moved = RigidTransform(asked.rotation, asked.translation - asked.rotation @ shift)
     here = match_poses(matcher, measured, asked, iterations=1)
     there = match_poses(matcher, away, moved, iterations=1)
-    back = there.translation + there.rotation @ shift.translation
-    np.testing.assert_allclose(there.rotation, here.rotation, atol=1e-4)
-    np.testing.assert_allclose(back, here.translation, atol=0.02)
+    back = there.translation + there.rotation @ shift
+    np.testing.assert_allclose(there.rotation, here.rotation, atol=1e-3)
+    np.testing.assert_allclose(back, here.translation, atol=0.1)
 
 
 def test_weights_of_nan_give_the_guess_back(matcher, scan):
@@ -228,9 +234,8 @@ def test_weights_of_nan_give_the_guess_back(matcher, scan):
 def test_a_scan_without_a_sensor_or_with_few_points_is_matched_too(matcher):
     ideal, truth = ideal_scan(vane(), random_view(vane(), seed=1))
     some = ideal.points[:: len(ideal.points) // 60].astype(np.float64)
-    frame = motion(vane(), [0, 0, 0], [5, 5, 5])
     for origin in ("auto", "unknown"):
-        few = clean_scan(frame.apply(some), sensor_origin=origin)
-        found = match_poses(matcher, few, batch(truth), iterations=1)
+        few = clean_scan(some + np.array([5.0, 5.0, 5.0]), sensor_origin=origin)
+        found = match_poses(matcher, few, guesses(truth), iterations=1)
         assert np.isfinite(found.rotation).all()
         assert np.isfinite(found.translation).all()

@@ -20,3 +20,8 @@ def test_every_cell_runs(path: Path, capsys) -> None:
     if path.stem == "scanner":
         assert space["off"].max() < 1e-3  # f32 points, 400 mm away
         assert "216 viewpoints, 54 of them for tests" in capsys.readouterr().out
+    if path.stem == "registration":
+        for result in (space["result"], space["again"]):
+            assert result.verdict.status == "accepted"
+        assert space["rotation_error_deg"] < 0.01  # its sigma is 0.0015 deg
+        assert space["chi_squared"] < 22.5  # 99.9 % of right poses

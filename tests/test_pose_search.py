@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 from example_scans import (
@@ -51,20 +49,22 @@ def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 # --- rotations ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("count", "cover_deg"), [(400, 28.0), (1200, 20.0)])
+@pytest.mark.parametrize(("count", "cover_deg"), [(400, 34.0), (1200, 24.0)])
 def test_spread_rotations_cover_all_rotations(count, cover_deg):
-    """The best possible covers are some 24 and 17 deg wide: 400 balls of SO(3)'s volume overlap."""
+    """``count`` balls of angle t fill SO(3) where count (t - sin t) = pi: 23.8 and 16.5 deg.
+
+    A cover needs more, since balls overlap; random rotations would leave holes of 45 and 33 deg.
+    """
     spread = spread_rotations(count)
     assert spread.shape == (count, 3, 3)
-    np.testing.assert_allclose(
-        spread @ spread.swapaxes(1, 2), np.eye(3)[None] + 0 * spread, atol=1e-12
-    )
+    gram = spread @ spread.swapaxes(1, 2)
+    np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(spread), 1, atol=1e-12)
-    probes = Rotation.random(3000, random_state=0).as_matrix()
+    probes = Rotation.random(5000, random_state=0).as_matrix()
     nearest = angle_deg(probes, spread).min(axis=1)
     assert nearest.max() < cover_deg
-    between = angle_deg(spread, spread) + 360 * np.eye(count)
-    assert between.min() > 0.5 * np.median(between.min(axis=1))  # no two are the same
+    between = (angle_deg(spread, spread) + 360 * np.eye(count)).min(axis=1)
+    assert between.min() > 0.5 * np.median(between)  # no two are the same
 
 
 def test_starts_put_the_middle_of_the_scan_where_it_belongs():
@@ -137,8 +137,8 @@ def test_challengers_of_a_box_are_its_symmetries():
     for axis in np.eye(3):
         symmetric = motion(box(), 180 * axis, np.zeros(3)) @ best
         angle, shift = distances(tried, symmetric, box())
-        # principal axes of 40,000 samples are good to half a degree
-        assert np.min(angle + shift) < 1.0
+        # principal axes of 40,000 samples are good to 0.6 deg, and a half turn doubles that
+        assert np.min(angle + shift) < 2.0
 
 
 def test_challengers_of_a_cube_are_quarter_turns_too():
@@ -269,5 +269,3 @@ def test_every_pose_of_a_search_is_rigid():
     for rotation in found.part_from_camera.rotation:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
         assert np.linalg.det(rotation) > 0
-    pairs = itertools.combinations(range(len(found)), 2)
-    assert all(a < b for a, b in pairs)
