@@ -17,15 +17,18 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 from scipy import stats
 from tqdm import tqdm
 
 from experiments import study
 from experiments.vane_views import VaneViews, beside, magnitudes, pose_error, with_noise
+from vanejax.covariance import uncertainty
 from vanejax.plotting.canvas import FAINT, INK, new_figure, save_figure, style_chart
 from vanejax.plotting.charts import SERIES
-from vanejax.refine import refine, uncertainty
+from vanejax.refine import refine
 from vanejax.residuals import RayCasting
 from vanejax.rigid import RigidTransform
 
@@ -285,7 +288,7 @@ def picture(levels: Sequence[dict[str, Any]]) -> Figure:
             noise, [level[name]["rms"] for level in levels], "o", color=SERIES[0], label="rms",
         )  # fmt: skip
         axes.axhline(PAPER[name], color=SERIES[5], linestyle="--", label="paper, mean")
-        axes.set_xscale("log")
+        _noise_axis(axes, noise)
         axes.set_yscale("log")
         axes.legend(frameon=False, fontsize=9, labelcolor=INK)
     style_chart(
@@ -295,10 +298,17 @@ def picture(levels: Sequence[dict[str, Any]]) -> Figure:
     low, high = levels[0]["coverage_interval_95"]
     panels[2].axhspan(low, high, color=FAINT, alpha=0.25, linewidth=0, label="chance allows")
     panels[2].plot(noise, [level["coverage_95"] for level in levels], "o-", color=SERIES[0])
-    panels[2].set_xscale("log")
+    _noise_axis(panels[2], noise)
     panels[2].set_ylim(0, 1.03)
     panels[2].legend(frameon=False, fontsize=9, labelcolor=INK, loc="lower left")
     return figure
+
+
+def _noise_axis(axes: Axes, noise_mm: Sequence[float]) -> None:
+    """Logarithmic, with the levels themselves as ticks."""
+    axes.set_xscale("log")
+    axes.set_xticks(noise_mm, [f"{level:g}" for level in noise_mm])
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def main(settings: argparse.Namespace) -> dict[str, Any]:

@@ -61,6 +61,12 @@ def summarize(
     judged: Sequence[Mapping[str, Any]], runs: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
     """ROC figures, and verdicts by kind of pose and by sensor."""
+    kinds = list(dict.fromkeys(row["kind"] for row in judged))
+    wrong_by_kind = {
+        kind: [row for row in judged if row["kind"] == kind and not row["right"]]
+        for kind in kinds
+        if kind != RIGHT
+    }
     figures = {}
     for name in FIGURES:
         right, wrong = figure_of(judged, name)
@@ -68,8 +74,11 @@ def summarize(
             figures[name] = {
                 "auc": area_under_roc(right, wrong),
                 "true_accepts_at_no_false": float(np.mean(right > wrong.max())),
+                "auc_by_kind": {
+                    kind: area_under_roc(right, figure_of(of_kind, name)[1])
+                    for kind, of_kind in wrong_by_kind.items()
+                },
             }
-    kinds = dict.fromkeys(row["kind"] for row in judged)
     sensors = dict.fromkeys(row["sensor"] for row in judged)
     return {
         "poses": {
@@ -124,29 +133,36 @@ def table(report: Mapping[str, Any]) -> str:
     """The report as aligned text."""
     poses = report["poses"]
     lines = [f"{poses['right']} right and {poses['wrong']} wrong poses", ""]
-    lines.append(f"{'told apart by':<34}{'AUC':>8}{'right accepted at no wrong':>28}")
+    kinds = [kind for kind in report["verdicts_by_kind"] if kind != RIGHT]
+    lines.append(
+        f"{'AUC against':<34}{'all':>8}"
+        + "".join(f"{kind:>15}" for kind in kinds)
+        + f"{'accepts at no wrong':>21}"
+    )
     for name, row in report["figures"].items():
-        lines.append(
-            f"  {FIGURES[name]:<32}{row['auc']:>8.4f}{row['true_accepts_at_no_false']:>28.1%}"
-        )
-    head = "".join(f"{status:>11}" for status in (*STATUSES, "(accepted without rivals)"))
-    lines += ["", f"{'pose':<34}{head}"]
+        cells = "".join(f"{row['auc_by_kind'][kind]:>15.3f}" for kind in kinds)
+        rate = row["true_accepts_at_no_false"]
+        lines.append(f"  {FIGURES[name]:<32}{row['auc']:>8.3f}{cells}{rate:>21.1%}")
+    head = "".join(f"{status:>11}" for status in STATUSES)
+    lines += ["", f"{'verdict on poses':<34}{head}{'accepted without rivals':>25}"]
     rows = list(report["verdicts_by_kind"].items())
     for sensor, words in report["verdicts_by_sensor"].items():
         rows += [(f"{sensor}, {word}", count) for word, count in words.items()]
     for name, count in rows:
         cells = "".join(f"{count[status]:>11}" for status in STATUSES)
-        lines.append(f"  {name:<32}{cells}{count['accepted_alone']:>27}")
-    lines += ["", f"{'register, no guess':<20}" + "".join(f"{s:>13}" for s in report["register"])]
+        lines.append(f"  {name:<32}{cells}{count['accepted_alone']:>25}")
+    head = "".join(f"{sensor:>18}" for sensor in report["register"])
+    lines += ["", f"{'register, no guess':<34}{head}"]
     outcomes = next(iter(report["register"].values()), {})
     for outcome in outcomes:
-        cells = "".join(f"{count[outcome]:>13}" for count in report["register"].values())
-        lines.append(f"  {outcome.replace('_', ' '):<26}"[:28].ljust(20) + cells)
-    for row in report["registered"]:
+        cells = "".join(f"{count[outcome]:>18}" for count in report["register"].values())
+        lines.append(f"  {outcome.replace('_', ' '):<32}{cells}")
+    for row in (*report["judged"], *report["registered"]):
         if row["verdict"] == "accepted" and not row["right"]:
             lines.append(
-                f"ACCEPTED AND WRONG: {row['part']}, {row['sensor']}: {row['rotation_deg']:.2f} "
-                f"deg, {row['translation_mm']:.2f} mm"
+                f"ACCEPTED AND WRONG: {row['part']}, {row['sensor']}, "
+                f"{row.get('kind', 'register')}: {row['rotation_deg']:.2f} deg, "
+                f"{row['translation_mm']:.2f} mm"
             )
     return "\n".join(lines)
 
@@ -177,7 +193,7 @@ def picture(report: Mapping[str, Any]) -> Figure:
     style_chart(bars, title="verdict by kind of pose", xlabel="share of the poses")
     bars.grid(False)
     figure.legend(
-        *bars.get_legend_handles_labels(), loc="outside upper right", ncols=3, frameon=False,
+        *bars.get_legend_handles_labels(), loc="outside lower right", ncols=3, frameon=False,
         labelcolor=INK,
     )  # fmt: skip
     return figure

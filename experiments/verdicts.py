@@ -32,13 +32,14 @@ from experiments.wrong_poses import (
     wrong_starts,
 )
 from vanejax import locate
+from vanejax.covariance import uncertainty
 from vanejax.errors import InputError
 from vanejax.measured_scan import MIN_POINTS, MeasuredScan
 from vanejax.part import Part
 from vanejax.plotting.canvas import save_figure
 from vanejax.pose_result import Verdict, Verification
-from vanejax.pose_search import concatenate, distances, distinct, is_same, search, select
-from vanejax.refine import refine, subset, uncertainty
+from vanejax.pose_search import challenge, concatenate, distances, distinct, is_same, search, select
+from vanejax.refine import refine, subset
 from vanejax.residuals import RayCasting
 from vanejax.rigid import RigidTransform
 from vanejax.scanner import Scanner
@@ -48,7 +49,7 @@ from vanejax.verification import View, evidence, verify
 
 QUICK_PARTS = (VANE, "vane_4", "flange_odd_hole", "box", "wedge")
 OTHER_PART_STARTS = 200
-OTHER_PART_POSES = 3
+OTHER_PART_POSES = 4
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -127,6 +128,7 @@ def judged_poses(scan: PosedScan, model: RayCasting, seed: int) -> Iterator[dict
 def other_part(scan: PosedScan, model: RayCasting, seed: int) -> dict[str, Any]:
     """A row for the best pose that a part finds in the scan of another one."""
     found = search(model, scan.points, count=OTHER_PART_STARTS, seed=seed)
+    found = challenge(model, scan.points, found, seed=seed)
     starts = [found.pose(k) for k in range(min(len(found), OTHER_PART_POSES))]
     return _row(scan, OTHER_PART, assess(model, scan.points, starts, seed)[0], right=False)
 
@@ -174,33 +176,45 @@ def _row(scan: PosedScan, kind: str, found: Assessed, *, right: bool) -> dict[st
 
 
 def measure(settings: argparse.Namespace) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """All poses judged, and all registrations."""
+    """All poses judged, and all registrations.
+
+    Raises:
+      InputError: a part or a sensor that is none.
+    """
     unknown = sorted(set(settings.sensors) - set(SENSORS))
     if unknown:
         raise InputError(f"no sensor {', '.join(unknown)}; there are {', '.join(SENSORS)}")
-    names = QUICK_PARTS if settings.quick else (VANE, *names_of_parts())
-    parts = parts_to_pose(settings.parts or names)
-    judged, runs = [], []
-    bar = tqdm(total=len(parts) * len(settings.sensors) * settings.scans, unit="scan")
-    before: list[PosedScan] = []
-    for name, challenge in parts.items():
-        model = make_model(challenge.part)
-        here = [
-            posed_scan(name, challenge, model.scanner, sensor, settings.seed + number)
+    names = settings.parts or (QUICK_PARTS if settings.quick else (VANE, *names_of_parts()))
+    parts = parts_to_pose(names)
+    models = {name: make_model(challenge.part) for name, challenge in parts.items()}
+    scans = {
+        name: [
+            posed_scan(name, challenge, models[name].scanner, sensor, settings.seed + number)
             for sensor in settings.sensors
             for number in range(settings.scans)
         ]
-        for scan in here:
-            bar.set_description(f"{name}, {scan.sensor}")
-            if len(scan.points) >= 2 * MIN_POINTS:
-                judged += judged_poses(scan, model, settings.seed)
-                runs.append(registered(scan, settings.seed))
-            bar.update()
-        # the scans of the part before this one
-        judged += [other_part(scan, model, settings.seed) for scan in before]
-        before = here
-    bar.close()
+        for name, challenge in parts.items()
+    }
+    judged, runs = [], []
+    every = [(place, scan) for place, name in enumerate(parts) for scan in scans[name]]
+    for place, scan in tqdm(every, "judging", unit="scan"):
+        if len(scan.points) < 2 * MIN_POINTS:
+            continue
+        judged += judged_poses(scan, models[scan.name], settings.seed)
+        runs.append(registered(scan, settings.seed))
+        for other in other_parts(place, list(parts)):
+            judged.append(other_part(scan, models[other], settings.seed))
     return judged, runs
+
+
+def other_parts(place: int, names: Sequence[str]) -> list[str]:
+    """Those sought in the scans of the part at a place of the list: never its near relatives.
+
+    Near relatives, such as a gear with and without keyway, stand beside each other.
+    """
+    count = len(names)
+    steps = {count // 2, count // 3} - {0}
+    return [names[(place + step) % count] for step in sorted(steps)]
 
 
 def _batch(poses: Sequence[RigidTransform]) -> RigidTransform:

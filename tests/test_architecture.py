@@ -48,6 +48,8 @@ LAYERS = [
     # host: fine registration
     "surface",
     "residuals",
+    "noise",
+    "covariance",
     "refine",
     "verification",
     "verdict",

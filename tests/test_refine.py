@@ -23,8 +23,10 @@ from example_scans import (
 from scipy.stats import chi2
 
 from vanejax.camera import look_at
+from vanejax.covariance import uncertainty
+from vanejax.noise import fit_noise
 from vanejax.part import Part
-from vanejax.refine import descend, fit_noise, refine, subset, uncertainty
+from vanejax.refine import descend, refine, subset
 from vanejax.residuals import RayCasting, Residuals, SurfaceMatching
 from vanejax.rigid import RigidTransform
 

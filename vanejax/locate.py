@@ -10,6 +10,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from vanejax.covariance import uncertainty
 from vanejax.errors import InputError
 from vanejax.matched_poses import icosahedral_rotations, match_poses
 from vanejax.measured_scan import MeasuredScan, clean_scan
@@ -29,7 +30,7 @@ from vanejax.pose_search import (
     settle,
     starts,
 )
-from vanejax.refine import descend, refine, subset, uncertainty
+from vanejax.refine import descend, refine, subset
 from vanejax.residuals import MeasurementModel, RayCasting, SurfaceMatching
 from vanejax.rigid import RigidTransform
 from vanejax.scan_file import load_scan
@@ -260,7 +261,7 @@ def _finish(
 def _near_guess(
     rivals: list[Rival], init: RigidTransform, part: Part, limits: Limits, notes: list[str]
 ) -> list[Rival]:
-    """Without those that a rough guess rules out: far from it and no better than the pose near it."""
+    """Without those that the guess rules out: far from it and no better than the pose near it."""
     kept = []
     for rival in rivals:
         turn, shift = distances(_batch(rival.part_from_camera), init, part)
