@@ -49,7 +49,6 @@ from vanejax.verification import View, evidence, verify
 
 QUICK_PARTS = (VANE, "vane_4", "flange_odd_hole", "box", "wedge")
 OTHER_PART_STARTS = 200
-OTHER_PART_POSES = 4
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,16 +76,21 @@ def make_model(part: Part) -> RayCasting:
 
 
 def assess(
-    model: RayCasting, points: np.ndarray, starts: Sequence[RigidTransform], seed: int = 0
+    model: RayCasting,
+    points: np.ndarray,
+    starts: Sequence[RigidTransform],
+    *,
+    rivals: Sequence[RigidTransform] = (),
+    seed: int = 0,
 ) -> list[Assessed]:
-    """Refines starts, and verifies and judges each with the others as its rivals.
+    """Refines starts, and verifies and judges each with the others, and ``rivals``, as its rivals.
 
     The steps, and the numbers of points, are those of `vanejax.locate`. Starts that end at a pose
     nearer than what counts as the same there are still judged each, but are no rivals.
     """
     part = model.part
     refined = [refine(model, points, start, seed=seed) for start in starts]
-    poses = _batch([found.part_from_camera for found in refined])
+    poses = _batch([*(found.part_from_camera for found in refined), *rivals])
     some = points[subset(points, locate.RIVAL_POINTS, seed + 2)]
     checked = subset(points, locate.VERIFIED_POINTS, seed + 3)
     few, all_checked = View(some, model.sensor_origin), View(points[checked], model.sensor_origin)
@@ -98,16 +102,16 @@ def assess(
         others = np.flatnonzero(~is_same(turn, shift, part))
         compared = concatenate(_batch([pose]), select(poses, others))
         said = evidence(model, compared, some, tolerance_mm=tolerance, view=few)
-        rivals = [
+        known = [
             Rival(said.preference(0, 1 + n), float(turn[o]), float(shift[o]), select(poses, o))
             for n, o in enumerate(others)
         ]
         seen = verify(model, pose, points, checked, tolerance_mm=tolerance, view=all_checked)
         sure = uncertainty(found, part.center)
         with_rivals, alone = (
-            judge(found, seen, sure, known, radius_mm=part.radius) for known in (rivals, ())
+            judge(found, seen, sure, told, radius_mm=part.radius) for told in (known, ())
         )
-        best = min((rival.preference for rival in rivals), default=np.inf)
+        best = min((rival.preference for rival in known), default=np.inf)
         result.append(Assessed(pose, seen, best, with_rivals, alone))
     return result
 
@@ -116,7 +120,7 @@ def judged_poses(scan: PosedScan, model: RayCasting, seed: int) -> Iterator[dict
     """A row for the true pose and for each distinct wrong pose to which a start led."""
     rng = np.random.default_rng([seed, *scan.name.encode()])
     kinds, starts = zip((RIGHT, scan.truth), *wrong_starts(scan, rng), strict=True)
-    found = assess(model, scan.points, starts, seed)
+    found = assess(model, scan.points, starts, seed=seed)
     poses = _batch([one.part_from_camera for one in found])
     wrong = np.array([not scan.is_right(one.part_from_camera) for one in found])
     wrong[0] = True  # stays in, whether right or lost
@@ -129,8 +133,9 @@ def other_part(scan: PosedScan, model: RayCasting, seed: int) -> dict[str, Any]:
     """A row for the best pose that a part finds in the scan of another one."""
     found = search(model, scan.points, count=OTHER_PART_STARTS, seed=seed)
     found = challenge(model, scan.points, found, seed=seed)
-    starts = [found.pose(k) for k in range(min(len(found), OTHER_PART_POSES))]
-    return _row(scan, OTHER_PART, assess(model, scan.points, starts, seed)[0], right=False)
+    best, *others = (found.pose(k) for k in range(min(len(found), 1 + locate.RIVALS)))
+    (assessed,) = assess(model, scan.points, [best], rivals=others, seed=seed)
+    return _row(scan, OTHER_PART, assessed, right=False)
 
 
 def registered(scan: PosedScan, seed: int) -> dict[str, Any]:

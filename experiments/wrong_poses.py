@@ -25,7 +25,7 @@ WHITE_MM = 0.1
 WHITE_CAMERA = Camera(width=320, height=256, near_mm=50.0)
 WHITE_DISTANCE = 6.0  # of the part's radius: the part fills half the image
 DISTANCE_MM = (230.0, 500.0)  # of the other sensors
-MOST_POINTS = 30_000  # of a scan: more of them cost time and tell poses apart no better
+MOST_POINTS = 12_000  # of a scan: more of them cost time and tell poses apart no better
 TURNS_DEG = (10.0, 30.0, 60.0, 90.0, 120.0, 180.0)
 NEAR_SYMMETRIES = 4  # of a part, the nearest
 # a pose farther off is not what the sensor could give: 5 deg and 5 mm for the depth camera, whose

@@ -19,6 +19,7 @@ LAYERS = [
     # the ground, for both sides
     "errors",
     "whole_file",
+    "array_file",
     "rigid",
     "pointcloud",
     # host: parts

@@ -5,15 +5,14 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import math
 import os
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vanejax.array_file import read_stored_arrays
 from vanejax.camera import Camera, Viewpoints
 from vanejax.errors import InputError
 from vanejax.part import Part
@@ -23,7 +22,6 @@ from vanejax.scanner import Scan, scan_views
 
 FORMAT = "vanejax scan set"
 VERSION = 1
-MAX_ARRAY_BYTES = 1 << 31
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -196,16 +194,10 @@ def load_scan_set(
     """
     path = Path(path)
     try:
-        with zipfile.ZipFile(path) as archive:
-            arrays = {
-                entry.filename.removesuffix(".npy"): _read_array(archive, entry, path)
-                for entry in archive.infolist()
-            }
+        arrays = read_stored_arrays(path)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError) as error:
-        if isinstance(error, InputError):
-            raise
+    except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: truncated or not a scan set ({error}); delete it and scan again"
         ) from error
@@ -219,22 +211,6 @@ def load_scan_set(
                 "delete it or choose another folder"
             )
     return _from_arrays(arrays, header, path)
-
-
-def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> np.ndarray:
-    """One array, after its header's shape was held against the bytes that are there."""
-    if entry.file_size > MAX_ARRAY_BYTES or entry.compress_type != zipfile.ZIP_STORED:
-        raise InputError(f"{path}: {entry.filename} is too large or compressed: not a scan set")
-    with archive.open(entry) as file:
-        version = np.lib.format.read_magic(file)
-        if version != (1, 0):
-            raise InputError(f"{path}: {entry.filename} has array format {version}, expected 1.0")
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-        data = file.read()
-    announced = math.prod(shape) * dtype.itemsize
-    if dtype.hasobject or fortran or len(data) != announced:
-        raise InputError(f"{path}: {entry.filename} does not hold the array that it announces")
-    return np.frombuffer(data, dtype).reshape(shape)
 
 
 def _read_header(raw: np.ndarray | None, path: Path) -> dict[str, Any]:

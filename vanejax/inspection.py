@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vanejax import cad_file, point_file
+from vanejax.array_file import array_header
 from vanejax.cad_file import MM_PER_UNIT, read_triangles
 from vanejax.errors import InputError
 from vanejax.measured_scan import (
@@ -332,12 +333,9 @@ def _array_names(path: Path) -> dict[str, str]:
 
 
 def _array_in_words(file: Any) -> str:
-    formats = np.lib.format
     try:
-        version = formats.read_magic(file)
-        reader = {(1, 0): formats.read_array_header_1_0, (2, 0): formats.read_array_header_2_0}
-        shape, _, dtype = reader[version](file)
-    except (ValueError, KeyError):
+        shape, _, dtype = array_header(file)
+    except ValueError:
         return "no array"
     return f"{list(shape)} {dtype}"
 

@@ -8,10 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import os
-import tokenize
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from vanejax.array_file import read_stored_arrays
 from vanejax.camera import Camera
 from vanejax.errors import InputError
 from vanejax.models.rpmnet import RpmNet
@@ -148,14 +146,13 @@ def load_model(path: str | os.PathLike[str]) -> TrainedMatcher:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: is too large for weights of vanejax")
-        with zipfile.ZipFile(path) as archive:
-            arrays = _read_arrays(archive, path)
+        arrays = read_stored_arrays(path)
     except FileNotFoundError:
         raise InputError(
             f"{path}: no such file (looked in {path.parent.absolute()}); "
             "`vanejax export WORKDIR` makes one"
         ) from None
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError) as error:
+    except (OSError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(
@@ -275,38 +272,6 @@ def _variables(model: RpmNet, arrays: Mapping[str, np.ndarray], where: str) -> A
         if not np.isfinite(value).all():
             raise InputError(f"{where}: {name} holds values that are not finite")
     return jax.tree.unflatten(jax.tree.structure(abstract), [arrays[name] for name in wanted])
-
-
-def _read_arrays(archive: zipfile.ZipFile, path: Path) -> dict[str, np.ndarray]:
-    entries = archive.infolist()
-    names = [entry.filename.removesuffix(".npy") for entry in entries]
-    if len(set(names)) != len(names):
-        raise InputError(f"{path}: holds an array twice; export it again")
-    # stored entries that are not twice there are no larger together than the file
-    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-        raise InputError(f"{path}: holds compressed arrays: not written by `vanejax export`")
-    if sum(entry.file_size for entry in entries) > path.stat().st_size:
-        raise InputError(f"{path}: announces more bytes than it has")
-    return {
-        name: _read_array(archive, entry, path) for name, entry in zip(names, entries, strict=True)
-    }
-
-
-def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> np.ndarray:
-    """One array, after its header's shape was held against the bytes that are there."""
-    with archive.open(entry) as file:
-        version = np.lib.format.read_magic(file)
-        if version != (1, 0):
-            raise InputError(f"{path}: {entry.filename} has array format {version}, expected 1.0")
-        try:
-            shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-        # what Python's own parsers make of rubbish
-        except (SyntaxError, tokenize.TokenError, RecursionError, MemoryError, TypeError) as error:
-            raise ValueError(f"{entry.filename} has no header") from error
-        data = file.read()
-    if dtype.hasobject or fortran or len(data) != math.prod(shape) * dtype.itemsize:
-        raise InputError(f"{path}: {entry.filename} does not hold the array that it announces")
-    return np.frombuffer(data, dtype).reshape(shape)
 
 
 def _read_header(raw: np.ndarray | None, path: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from vanejax.array_file import array_header
 from vanejax.errors import InputError
 from vanejax.pcd_file import read_pcd
 from vanejax.ply_file import read_ply
@@ -244,12 +245,9 @@ def _read_numpy(path: Path) -> PointFile:
 
 def _read_array(file: BinaryIO, size: int, path: Path, name: str) -> np.ndarray:
     """The array in a stream of ``size`` bytes; only numbers, and no more than are there."""
-    formats = np.lib.format
     try:
-        version = formats.read_magic(file)
-        reader = {(1, 0): formats.read_array_header_1_0, (2, 0): formats.read_array_header_2_0}
-        shape, fortran, dtype = reader[version](file)
-    except (ValueError, KeyError) as error:
+        shape, fortran, dtype = array_header(file)
+    except ValueError as error:
         raise InputError(f"{path}: {name} is damaged, or no NumPy array") from error
     if dtype.kind not in "fiu":
         raise InputError(f"{path}: {name} holds {dtype}, not numbers")
