@@ -218,3 +218,38 @@ def test_export_leaves_the_old_file_when_it_fails(ball, tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["ball.stl"]
     with pytest.raises(InputError, match="missing"):
         ball.export(tmp_path / "missing" / "ball.stl")
+
+
+def open_box() -> tuple[np.ndarray, np.ndarray]:
+    """A box of 60 mm without its lid, half of its faces inside out."""
+    box = trimesh.creation.box((60, 60, 60))
+    faces = box.faces[box.face_normals[:, 2] < 0.5].copy()
+    faces[::2] = faces[::2, ::-1]
+    return np.asarray(box.vertices), faces
+
+
+def test_an_open_surface_is_refused_unless_it_may_be_open() -> None:
+    vertices, faces = open_box()
+    with pytest.raises(InputError, match="not a closed solid"):
+        part_from_mesh(vertices, faces, name="tray")
+    part = part_from_mesh(vertices, faces, name="tray", must_be_closed=False)
+    assert not part.closed
+    assert len(part.mesh.faces) == len(faces)
+    assert "open surface" in part.notes[-1]
+    assert "open edges" in part.notes[-1]
+
+
+def test_a_solid_is_the_same_whether_it_must_be_closed_or_not() -> None:
+    box = trimesh.creation.box((60, 60, 60))
+    strict = part_from_mesh(box.vertices, box.faces, name="box")
+    lenient = part_from_mesh(box.vertices, box.faces, name="box", must_be_closed=False)
+    assert lenient.closed
+    assert strict.sha256 == lenient.sha256
+
+
+def test_what_is_no_surface_is_refused_either_way() -> None:
+    vertices, faces = open_box()
+    vertices = vertices.copy()
+    vertices[0] = np.nan
+    with pytest.raises(InputError, match="not finite"):
+        part_from_mesh(vertices, faces, name="tray", must_be_closed=False)

@@ -74,7 +74,7 @@ def register(
 
     Args:
       scan: a file (PLY, PCD, XYZ, CSV, NPZ), points [N, 3] in mm, or a `MeasuredScan`.
-      part: a CAD file or a `Part`.
+      part: a CAD file or a `Part`; an open surface will do.
       units_scan: of a scan file: mm, cm, m, in, ...; "auto" takes mm, or m where only that fits.
       units_cad: of a CAD file.
       sensor_origin: [3] mm in the scan's frame; "auto" takes the scan's origin where that can be
@@ -91,7 +91,8 @@ def register(
     """
     seconds: dict[str, float] = {}
     with _timed(seconds, "read"):
-        part = part if isinstance(part, Part) else load_part(part, units=units_cad)
+        if not isinstance(part, Part):
+            part = load_part(part, units=units_cad, must_be_closed=False)
         if isinstance(weights, str | os.PathLike):
             weights = load_model(weights)
         if weights is not None:

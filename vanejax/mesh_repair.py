@@ -63,6 +63,26 @@ def repair_solid(
     return united(bodies, name, notes), tuple(notes)
 
 
+def open_surface(
+    vertices: np.ndarray, faces: np.ndarray, *, name: str
+) -> tuple[Triangles, tuple[str, ...]]:
+    """The triangles as they are, in the same order as `repair_solid` would give them.
+
+    For surfaces that are no solid: sheets without thickness, models with missing faces. Which side
+    of a face is outside is then unknown.
+
+    Raises:
+      InputError: the mesh is empty, not finite, or too large.
+    """
+    notes: list[str] = []
+    mesh = drop_doubled(drop_collapsed(_checked(vertices, faces, name), notes), notes)
+    if not len(mesh.faces):
+        raise InputError(
+            f"{name}: every face is collapsed to a line or a point; export the part again"
+        )
+    return mesh, tuple(notes)
+
+
 def _checked(vertices: np.ndarray, faces: np.ndarray, name: str) -> Triangles:
     """Shape, range and finiteness; then the vertices in use, rounded, unique and sorted."""
     vertices = np.asarray(vertices, np.float64)

@@ -14,7 +14,7 @@ import trimesh
 from vanejax.cad_file import MM_PER_UNIT, read_triangles
 from vanejax.camera import Camera
 from vanejax.errors import InputError
-from vanejax.mesh_repair import repair_solid
+from vanejax.mesh_repair import open_surface, repair_solid
 
 # in the order in which a wrong unit is likely: "ft" comes last, few write CAD in it
 _UNIT_NAMES = {
@@ -40,11 +40,14 @@ class Part:
         the same arrays, and face ids mean the same, whatever file it came from.
       name: for reports; the file's stem.
       notes: what was repaired, a sentence each.
+      closed: whether it is a solid; if not, its faces may look either way, and are seen from both
+        sides.
     """
 
     mesh: trimesh.Trimesh
     name: str
     notes: tuple[str, ...] = ()
+    closed: bool = True
 
     @functools.cached_property
     def center(self) -> np.ndarray:
@@ -125,7 +128,13 @@ class Part:
             partial.unlink(missing_ok=True)
 
 
-def load_part(path: str | os.PathLike[str], *, units: str, camera: Camera | None = None) -> Part:
+def load_part(
+    path: str | os.PathLike[str],
+    *,
+    units: str,
+    camera: Camera | None = None,
+    must_be_closed: bool = True,
+) -> Part:
     """Reads a CAD file: STL, OBJ, PLY, GLB, GLTF, or STEP with the extra ``vanejax[step]``.
 
     Args:
@@ -134,6 +143,7 @@ def load_part(path: str | os.PathLike[str], *, units: str, camera: Camera | None
         metres by their standard, so ``"m"`` unless the exporter broke it. STEP knows its unit:
         `units` must agree with it.
       camera: its field of view and working range tell a wrong unit; default `Camera()`.
+      must_be_closed: whether to refuse what is no solid. Registration needs none.
 
     Returns:
       The part in mm, repaired where that is safe; `Part.notes` says what was done.
@@ -147,20 +157,32 @@ def load_part(path: str | os.PathLike[str], *, units: str, camera: Camera | None
     finite = vertices[np.isfinite(vertices).all(axis=1)]
     if len(finite):
         notes += _check_size(float(np.ptp(finite, axis=0).max()), units, camera or Camera(), path)
-    part = part_from_mesh(vertices, faces, name=path.name)
+    part = part_from_mesh(vertices, faces, name=path.name, must_be_closed=must_be_closed)
     return dataclasses.replace(part, name=path.stem, notes=(*notes, *part.notes))
 
 
-def part_from_mesh(vertices: np.ndarray, faces: np.ndarray, *, name: str) -> Part:
+def part_from_mesh(
+    vertices: np.ndarray, faces: np.ndarray, *, name: str, must_be_closed: bool = True
+) -> Part:
     """A part from vertices [V, 3] in mm and faces [F, 3], checked and repaired.
 
     Raises:
-      InputError: it is no closed solid and cannot be made one safely; see `repair_solid`.
+      InputError: it is no closed solid and cannot be made one safely, see `repair_solid`; or,
+        without ``must_be_closed``, it is no surface at all.
     """
-    solid, notes = repair_solid(vertices, faces, name=name)
+    closed = True
+    try:
+        solid, notes = repair_solid(vertices, faces, name=name)
+    except InputError as error:
+        if must_be_closed:
+            raise
+        solid, notes = open_surface(vertices, faces, name=name)
+        why = str(error).removeprefix(f"{name}: ").partition(";")[0]
+        notes = (*notes, f"is taken as an open surface, seen from both sides ({why})")
+        closed = False
     mesh = trimesh.Trimesh(solid.points, solid.faces, process=False)
     mesh.mutable = False  # center, radius and sha256 are remembered
-    return Part(mesh=mesh, name=name, notes=notes)
+    return Part(mesh=mesh, name=name, notes=notes, closed=closed)
 
 
 def _check_size(read: float, units: str, camera: Camera, path: Path) -> tuple[str, ...]:

@@ -29,6 +29,11 @@ KEPT_POINTS = 3_000
 KEPT_ITERATIONS = 15
 CHALLENGED = 12
 HOPELESS = 0.6  # of the best score: what ends below is no rival
+# symmetries of order 2 to 12, and of gears
+TURNS_DEG = (
+    180,
+    *(sign * turn for turn in (120, 90, 72, 60, 45, 36, 30, 20, 15) for sign in (1, -1)),
+)
 CHALLENGE_POINTS = 600
 CHALLENGE_ITERATIONS = 10
 LEAST_TOLERANCE = 0.005  # of the part's radius, while poses are still on their way
@@ -91,7 +96,8 @@ def starts(model: MeasurementModel, points: np.ndarray, rotations: np.ndarray) -
     samples, normals = surface.points[:1000], surface.normals[:1000]
     if isinstance(model, RayCasting):
         view = middle - model.sensor_origin
-        facing = np.maximum(-(normals @ (rotations @ (view / np.linalg.norm(view))).T), 0) + 1e-6
+        facing = -(normals @ (rotations @ (view / np.linalg.norm(view))).T)
+        facing = np.maximum(facing if model.part.closed else np.abs(facing), 0) + 1e-6
     else:
         facing = np.ones((len(samples), len(rotations)))
     visible = (facing / facing.sum(axis=0)).T @ samples
@@ -156,19 +162,15 @@ def noise_level(model: MeasurementModel, poses: RigidTransform, points: np.ndarr
 def challengers(surface: Surface, best: RigidTransform) -> RigidTransform:
     """Poses where a part of this shape may look as at the best one, turned and shifted.
 
-    Turned about the three principal axes of its surface and the diagonals between them by 180, 120,
-    90, 60, 45 and 30 deg, as parts have symmetries, about the middle of the surface; and shifted
+    Turned by `TURNS_DEG` about the three principal axes of its surface, and by 180 deg about the
+    diagonals between them, as parts have symmetries, about the middle of the surface; and shifted
     along the three axes by an eighth and a quarter of the length: the pitch of repeated features.
     """
     points = surface.points
     middle = points.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov((points - middle).T))
     axes = axes.T
-    turns = [
-        axes[k] * np.radians(a)
-        for k in range(3)
-        for a in (180, 90, -90, 120, -120, 60, -60, 45, -45, 30, -30)
-    ]
+    turns = [axis * np.radians(angle) for axis in axes for angle in TURNS_DEG]
     for i, j in ((0, 1), (1, 2), (0, 2)):
         for sign in (1, -1):
             diagonal = (axes[i] + sign * axes[j]) / np.sqrt(2)

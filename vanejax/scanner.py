@@ -115,6 +115,7 @@ class Scanner:
 
         A ray that first meets the back of a face counts as a miss: it started inside the solid, or
         it met a vertex exactly and slipped in, which Embree's robust mode prevents at edges only.
+        Open surfaces are seen from both sides.
 
         Args:
           origins: [N, 3] mm, part frame.
@@ -152,8 +153,12 @@ class Scanner:
         ).reshape(directions.shape[:-1])
         normals = self._normals[face]
         closing = np.einsum("...i,...i->...", normals, directions)
-        missed = (face < 0) | (closing >= -EDGE_ON_COSINE)
         gap = self._plane_mm[face] - np.einsum("...i,...i->...", normals, origins)
+        if not self.part.closed:  # the normal that faces the ray counts
+            side = -np.sign(closing)
+            normals *= side[..., None]
+            gap, closing = side * gap, side * closing
+        missed = (face < 0) | (closing >= -EDGE_ON_COSINE)
         closing[missed] = 1.0
         distance = gap / closing
         distance[missed] = np.inf
@@ -239,7 +244,7 @@ class Scanner:
             measured = np.abs(cosine) > EDGE_ON_COSINE
             depth = np.divide(plane[face], closing, out=np.zeros_like(closing), where=measured)
             keep = (depth >= camera.near_mm) & (depth <= camera.far_mm)
-            if nearest >= camera.near_mm:
+            if nearest >= camera.near_mm and self.part.closed:
                 # not cut open, so a back face means a ray slipped in through a vertex, as in `cast`
                 keep &= closing < 0
             pixel = rows[strip][row] * camera.width + columns[column]

@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from vanejax.scan_file import load_scan
 
-    part = workpiece.load_workpiece(arguments)
+    part = workpiece.load_workpiece(arguments, must_be_closed=False)
     scan = load_scan(
         arguments.scan,
         units=arguments.units_scan,

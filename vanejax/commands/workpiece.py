@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def load_workpiece(arguments: argparse.Namespace) -> Part:
+def load_workpiece(arguments: argparse.Namespace, *, must_be_closed: bool = True) -> Part:
     """The part that CAD and ``--units-cad`` name.
 
     Raises:
@@ -39,4 +39,4 @@ def load_workpiece(arguments: argparse.Namespace) -> Part:
         return guide_vane()
     from vanejax.part import load_part
 
-    return load_part(arguments.cad, units=arguments.units_cad)
+    return load_part(arguments.cad, units=arguments.units_cad, must_be_closed=must_be_closed)
