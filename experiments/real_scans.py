@@ -28,6 +28,7 @@ from vanejax.cad_file import MM_PER_UNIT
 from vanejax.errors import InputError
 from vanejax.locate import register
 from vanejax.part import Part, load_part
+from vanejax.pose_file import rigid_from_matrix
 from vanejax.rigid import RigidTransform
 
 TRUTH = "ground_truth.json"
@@ -90,9 +91,7 @@ def _known(entry: Any, folder: Path, where: str) -> Known:
     poses = poses[None] if poses.ndim == 2 else poses
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
         raise InputError(f"{where}: scan_from_cad_mm has shape {list(poses.shape)}, not [S, 4, 4]")
-    turns = poses[:, :3, :3]
-    if not np.allclose(turns @ turns.swapaxes(1, 2), np.eye(3)[None], atol=1e-4):
-        raise InputError(f"{where}: scan_from_cad_mm holds a matrix that is no rigid motion")
+    poses = np.stack([rigid_from_matrix(pose, where=where).as_matrix() for pose in poses])
     return Known(scan, cad, scan_units, units[0], poses)
 
 

@@ -18,6 +18,7 @@ from vanejax.model_file import TrainedMatcher, load_model
 from vanejax.rigid import RigidTransform
 
 NOISE_MM, START_DEG, START_MM = 0.1, 5.0, 5.0
+PIXELS = 128  # across, of the scans that are only counted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,8 +58,9 @@ class Bench:
 
     @functools.cached_property
     def view(self) -> int:
-        """The test view with most points, seen at a tenth of the resolution."""
-        coarse = dataclasses.replace(self.views, camera=self.views.camera.scaled(0.1))
+        """The test view with most points, as seen at few pixels."""
+        camera = self.views.camera
+        coarse = dataclasses.replace(self.views, camera=camera.scaled(PIXELS / camera.width))
         return max(self.views.select("test"), key=lambda view: len(coarse.points(view)))
 
     @functools.cached_property

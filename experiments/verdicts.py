@@ -37,7 +37,7 @@ from vanejax.errors import InputError
 from vanejax.measured_scan import MIN_POINTS, MeasuredScan
 from vanejax.part import Part
 from vanejax.plotting.canvas import save_figure
-from vanejax.pose_result import Verdict, Verification
+from vanejax.pose_result import Refinement, Verdict, Verification
 from vanejax.pose_search import challenge, concatenate, distances, distinct, is_same, search, select
 from vanejax.refine import refine, subset
 from vanejax.residuals import RayCasting
@@ -48,7 +48,7 @@ from vanejax.verdict import Rival, judge
 from vanejax.verification import View, evidence, verify
 
 QUICK_PARTS = (VANE, "vane_4", "flange_odd_hole", "box", "wedge")
-OTHER_PART_STARTS = 200
+OTHER_PART_STARTS = 150
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -78,21 +78,18 @@ def make_model(part: Part) -> RayCasting:
 def assess(
     model: RayCasting,
     points: np.ndarray,
-    starts: Sequence[RigidTransform],
+    refined: Sequence[Refinement],
     *,
     rivals: Sequence[RigidTransform] = (),
-    seed: int = 0,
 ) -> list[Assessed]:
-    """Refines starts, and verifies and judges each with the others, and ``rivals``, as its rivals.
+    """Verifies refined poses and judges each with the others, and ``rivals``, as its rivals.
 
-    The steps, and the numbers of points, are those of `vanejax.locate`. Starts that end at a pose
-    nearer than what counts as the same there are still judged each, but are no rivals.
+    The steps, and the numbers of points, are those of `vanejax.locate`.
     """
     part = model.part
-    refined = [refine(model, points, start, seed=seed) for start in starts]
     poses = _batch([*(found.part_from_camera for found in refined), *rivals])
-    some = points[subset(points, locate.RIVAL_POINTS, seed + 2)]
-    checked = subset(points, locate.VERIFIED_POINTS, seed + 3)
+    some = points[subset(points, locate.RIVAL_POINTS, 2)]
+    checked = subset(points, locate.VERIFIED_POINTS, 3)
     few, all_checked = View(some, model.sensor_origin), View(points[checked], model.sensor_origin)
     result = []
     for found in refined:
@@ -120,13 +117,15 @@ def judged_poses(scan: PosedScan, model: RayCasting, seed: int) -> Iterator[dict
     """A row for the true pose and for each distinct wrong pose to which a start led."""
     rng = np.random.default_rng([seed, *scan.name.encode()])
     kinds, starts = zip((RIGHT, scan.truth), *wrong_starts(scan, rng), strict=True)
-    found = assess(model, scan.points, starts, seed=seed)
-    poses = _batch([one.part_from_camera for one in found])
-    wrong = np.array([not scan.is_right(one.part_from_camera) for one in found])
-    wrong[0] = True  # stays in, whether right or lost
-    kept = np.flatnonzero(wrong)
-    for k in kept[distinct(select(poses, kept), model.part, len(kept))]:
-        yield _row(scan, kinds[k], found[k], right=scan.is_right(found[k].part_from_camera))
+    refined = [refine(model, scan.points, start, seed=seed) for start in starts]
+    # the true pose stays in, whether it was kept or lost; what came back to it says nothing new
+    kept = np.array(
+        [k for k, one in enumerate(refined) if k == 0 or not scan.is_right(one.part_from_camera)]
+    )
+    poses = _batch([refined[k].part_from_camera for k in kept])
+    kept = kept[distinct(poses, model.part, len(kept))]
+    for k, found in zip(kept, assess(model, scan.points, [refined[k] for k in kept]), strict=True):
+        yield _row(scan, kinds[k], found, right=scan.is_right(found.part_from_camera))
 
 
 def other_part(scan: PosedScan, model: RayCasting, seed: int) -> dict[str, Any]:
@@ -134,7 +133,8 @@ def other_part(scan: PosedScan, model: RayCasting, seed: int) -> dict[str, Any]:
     found = search(model, scan.points, count=OTHER_PART_STARTS, seed=seed)
     found = challenge(model, scan.points, found, seed=seed)
     best, *others = (found.pose(k) for k in range(min(len(found), 1 + locate.RIVALS)))
-    (assessed,) = assess(model, scan.points, [best], rivals=others, seed=seed)
+    refined = refine(model, scan.points, best, seed=seed)
+    (assessed,) = assess(model, scan.points, [refined], rivals=others)
     return _row(scan, OTHER_PART, assessed, right=False)
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from example_scans import (
     MIDDLE,
-    SMALL,
     batch,
     box,
     disturbed,
@@ -24,10 +23,9 @@ from scipy.stats import chi2
 
 from vanejax.camera import look_at
 from vanejax.covariance import uncertainty
-from vanejax.noise import fit_noise
 from vanejax.part import Part
 from vanejax.refine import descend, refine, subset
-from vanejax.residuals import RayCasting, Residuals, SurfaceMatching
+from vanejax.residuals import RayCasting, SurfaceMatching
 from vanejax.rigid import RigidTransform
 
 CERTAIN = chi2.ppf(0.9999, 6)  # 27.9: one right draw in 10,000 is farther off
@@ -331,86 +329,6 @@ def test_errors_that_go_together_widen_the_covariance(fine):
     assert min(ratio) > 10
     # white noise's covariance alone would give hundreds
     assert np.mean(errors) < 4 * 6
-
-
-def residuals(along: np.ndarray, cosine: np.ndarray) -> Residuals:
-    """Of one pose, every ray a hit."""
-    return Residuals(
-        deviation_mm=(along * cosine)[None],
-        jacobian=np.zeros((1, len(along), 6)),
-        cosine=cosine[None],
-        hit=np.ones((1, len(along)), bool),
-    )
-
-
-@pytest.mark.parametrize(
-    ("range_mm", "lateral_mm"), [(0.1, 0.0), (0.1, 0.1), (0.05, 0.2), (0.5, 0.3)]
-)
-def test_range_and_lateral_noise_are_told_apart(range_mm, lateral_mm):
-    rng = np.random.default_rng(0)
-    cosine = np.cos(np.radians(rng.uniform(5, 80, 20_000)))
-    sigma = np.hypot(range_mm, lateral_mm * np.sqrt(1 / cosine**2 - 1))
-    noise = fit_noise(residuals(sigma * rng.normal(size=len(cosine)), cosine))
-    # a median of 1,700 is good to 3 %, and the two follow from twelve of them
-    assert noise.range_mm == pytest.approx(range_mm, rel=0.15)
-    assert noise.lateral_mm == pytest.approx(lateral_mm, rel=0.15, abs=0.15 * range_mm)
-    assert np.isinf(noise.degrees_of_freedom)
-    np.testing.assert_allclose(noise.sigma_mm(cosine), sigma, rtol=0.15)
-
-
-@pytest.mark.parametrize("freedom", [2.0, 4.0, np.inf])
-def test_the_tails_are_found(freedom):
-    rng = np.random.default_rng(1)
-    cosine = np.cos(np.radians(rng.uniform(5, 60, 20_000)))
-    size = len(cosine)
-    draws = rng.normal(size=size) if np.isinf(freedom) else rng.standard_t(freedom, size)
-    noise = fit_noise(residuals(0.2 * draws, cosine))
-    near = {2.0: (1.5, 2, 3), 4.0: (3, 4, 6), np.inf: (np.inf,)}[freedom]
-    assert noise.degrees_of_freedom in near
-    assert noise.range_mm == pytest.approx(0.2, rel=0.15)  # of the t's core, not of all
-
-
-def test_gross_errors_do_not_pass_for_noise():
-    rng = np.random.default_rng(2)
-    cosine = np.cos(np.radians(rng.uniform(5, 60, 5_000)))
-    along = 0.1 * rng.normal(size=len(cosine))
-    along[::10] = rng.uniform(-30, 30, len(along[::10]))
-    noise = fit_noise(residuals(along, cosine))
-    assert noise.range_mm == pytest.approx(0.1, rel=0.25)
-
-
-def test_no_noise_and_few_points_are_no_trouble():
-    for count in (5, 29, 200):
-        noise = fit_noise(residuals(np.zeros(count), np.full(count, 0.7)))
-        assert 0 < noise.range_mm < 1e-5
-        assert noise.lateral_mm == 0
-
-
-def test_uncertainty_reads_the_covariance():
-    rng = np.random.default_rng(3)
-    root = rng.normal(size=(6, 6)) * np.repeat([1e-4, 1e-2], 3)[:, None]
-    covariance = root @ root.T
-    found = refine(*_ideal_call())
-    fields = dict(vars(found), information=np.linalg.inv(covariance))
-    sure = uncertainty(type(found)(**fields), [1.0, 2.0, 3.0])
-    np.testing.assert_allclose(sure.covariance, covariance, rtol=1e-6, atol=1e-14)
-    sigma = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(sure.rotation_sigma_deg, np.degrees(sigma[:3]), rtol=1e-6)
-    np.testing.assert_allclose(sure.translation_sigma_mm, sigma[3:], rtol=1e-6)
-    axis = sure.weakest_rotation_axis
-    largest = np.degrees(np.sqrt(axis @ covariance[:3, :3] @ axis))
-    assert sure.weakest_rotation_sigma_deg == pytest.approx(largest)
-    assert largest >= sure.rotation_sigma_deg.max() - 1e-12
-    axis = sure.weakest_translation_axis
-    largest = np.sqrt(axis @ covariance[3:, 3:] @ axis)
-    assert sure.weakest_translation_sigma_mm == pytest.approx(largest)
-    assert axis[np.argmax(np.abs(axis))] > 0
-    np.testing.assert_array_equal(sure.center, [1, 2, 3])
-
-
-def _ideal_call() -> tuple[RayCasting, np.ndarray, RigidTransform]:
-    points, truth = measured_points(box(), look_at([200.0, 150, 300], box().center), camera=SMALL)
-    return model(box()), points, truth
 
 
 # --- subsets ------------------------------------------------------------------------------------

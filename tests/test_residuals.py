@@ -24,7 +24,7 @@ from hypothesis.extra.numpy import arrays
 
 from vanejax.camera import look_at
 from vanejax.part import part_from_mesh
-from vanejax.residuals import MOST_EXACT, SurfaceMatching, moved
+from vanejax.residuals import SurfaceMatching, moved
 from vanejax.rigid import RigidTransform
 
 
@@ -208,12 +208,11 @@ def test_a_batch_of_poses_is_each_of_them():
                 )
 
 
-def test_many_misses_are_measured_between_the_surface_and_its_samples():
-    """Feet on faces take 20 us each; for very many of them samples will do."""
+def test_misses_are_measured_between_the_surface_and_its_samples():
     part = box()
     pose = pointing_at(part, [0, 0, 300])
     rng = np.random.default_rng(0)
-    target = rng.uniform([60, -25, 0], [70, 15, 20], (MOST_EXACT + 1, 3))
+    target = rng.uniform([60, -25, 0], [70, 15, 20], (3_000, 3))
     points = pose.inverse().apply(target)
     now = model(part).residuals(batch(pose), points)
     assert not now.hit.any()

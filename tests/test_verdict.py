@@ -50,7 +50,7 @@ REJECTED = {
     "50% of the surface that the sensor should have seen was not measured": {
         "unmeasured_share": 0.5
     },
-    "the points lie 2.5 mm off the surface": {"tolerance_mm": 7.5},
+    "the points lie 3 mm off the surface": {"tolerance_mm": 9.0},
 }
 
 
@@ -67,13 +67,24 @@ def test_each_fault_rejects_with_its_figure(reason):
         ("inlier_share", Limits().least_inlier_share),
         ("violation_share", Limits().most_violation_share),
         ("unmeasured_share", Limits().most_unmeasured_share),
-        ("tolerance_mm", 3 * Limits().most_noise * RADIUS),
     ],
 )
 def test_the_limit_itself_is_allowed(field, limit):
     worse = -1 if field == "inlier_share" else 1
     assert verdict(**{field: limit - worse * 1e-9}).status == "accepted"
     assert verdict(**{field: limit + worse * 1e-6}).status == "rejected"
+
+
+def test_noise_is_doubtful_first_and_then_a_fault():
+    limits = Limits()
+    doubtful, fault = (3 * share * RADIUS for share in (limits.doubtful_noise, limits.most_noise))
+    assert doubtful < fault
+    assert verdict(tolerance_mm=doubtful - 1e-9).status == "accepted"
+    found = verdict(tolerance_mm=doubtful + 1e-6)
+    assert found.status == "ambiguous"
+    assert "1.4 mm off the surface, 2.0% of the part's radius" in found.reason
+    assert verdict(tolerance_mm=fault - 1e-9).status == "ambiguous"
+    assert verdict(tolerance_mm=fault + 1e-6).status == "rejected"
 
 
 def test_few_inliers_are_counted_not_shared():
@@ -155,6 +166,8 @@ def test_a_weak_direction_is_ambiguous_and_named(axis, words):
         (Limits(most_violation_share=0.001), {}),
         (Limits(most_unmeasured_share=0.01), {}),
         (Limits(most_noise=0.001), {}),
+        (Limits(doubtful_noise=0.001), {}),
+        (Limits(doubtful_noise=0.03), {"tolerance_mm": 3 * 0.025 * RADIUS}),
         (Limits(least_inliers=2000), {}),
         (Limits(least_preference=30.0), {}),
         (Limits(most_rotation_sigma_deg=1e-4), {}),

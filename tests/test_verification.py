@@ -233,6 +233,20 @@ def test_half_a_scan_lacks_half(seen):
     assert found.score < checked(vane(), truth, points).score - 0.2
 
 
+@pytest.mark.parametrize(("flat_deg", "missing"), [(70, True), (78, False)])
+def test_surface_seen_too_flat_may_be_missing(flat_deg, missing):
+    """The box from the side: its end is measured, its top at ``flat_deg`` of incidence is not."""
+    offset = 400 * np.array([np.sin(np.radians(flat_deg)), 0.0, np.cos(np.radians(flat_deg))])
+    points, truth = measured_points(box(), look_at(box().center + offset, box().center))
+    end = points[truth.apply(points)[:, 0] > 46.5]
+    found = checked(box(), truth, end)
+    assert 100 < len(end) < 0.8 * len(points)
+    if missing:
+        assert found.unmeasured_share > 0.15
+    else:
+        assert found.unmeasured_share < 0.05
+
+
 def test_thinning_is_no_hole(seen):
     points, truth = seen
     rng = np.random.default_rng(0)

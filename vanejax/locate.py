@@ -46,8 +46,8 @@ VERIFIED_POINTS = 100_000
 # than the second is not on the part
 LEAST_TOLERANCE, MOST_TOLERANCE = 0.001, 0.12
 REACH = 0.3  # of the part's radius: how far a surface partner is sought where no ray is known
-# one search more with three times the starts where the first ends in a rejection
-STARTS = (400, 1200)
+# one search more with twice the starts where the first ends in a rejection
+STARTS = (400, 800)
 # a guess is good to this; a pose farther away that fits as well is no reason to doubt it
 GUESS_DEG, GUESS_SHIFT = 30.0, 0.3
 MATCH_ITERATIONS = 1  # of RPM-Net from each of 60 rotations: ray casting does the rest
@@ -104,7 +104,7 @@ def register(
             scan = load_scan(
                 scan, units=units_scan, part_extent_mm=part.extent_mm, sensor_origin=sensor_origin
             )
-    result = _locate(scan, part, init, weights, limits, seed, seconds)
+    result = _locate(scan, part, init, weights, limits, seed, seconds, STARTS)
     if scan.origin_is_assumed and result.verdict.status == "rejected":
         # perhaps the cloud was moved after it was taken: then the rays are wrong, not the pose
         merged = dataclasses.replace(
@@ -116,7 +116,7 @@ def register(
                 "sensor's place is taken as unknown",
             ),
         )
-        other = _locate(merged, part, init, weights, limits, seed, seconds)
+        other = _locate(merged, part, init, None, limits, seed, seconds, STARTS[:1])
         if other.verdict.status == "accepted":
             return other
     return result
@@ -130,12 +130,13 @@ def _locate(
     limits: Limits | None,
     seed: int,
     seconds: dict[str, float],
+    counts: tuple[int, ...],
 ) -> PoseResult:
     """Tries sources of poses, cheapest first, until one is not rejected."""
     with _timed(seconds, "set up"):
         model = _model(scan, part)
     results = []
-    for found in _sources(model, scan, init, weights, seed, seconds):
+    for found in _sources(model, scan, init, weights, seed, seconds, counts):
         result = _finish(model, scan, found, init, limits, seed, seconds)
         if result.verdict.status != "rejected":
             return result
@@ -160,6 +161,7 @@ def _sources(
     weights: TrainedMatcher | None,
     seed: int,
     seconds: dict[str, float],
+    counts: tuple[int, ...],
 ) -> Iterator[Candidates]:
     """Candidates from the guess; else from RPM-Net; else from more and more rotations."""
     points = scan.points
@@ -183,7 +185,7 @@ def _sources(
         with _timed(seconds, "search"):
             found = search(model, points, extra=matched, count=0, seed=seed)
         yield found
-    for attempt, count in enumerate(STARTS):
+    for attempt, count in enumerate(counts):
         with _timed(seconds, "search"):
             found = search(model, points, count=count, seed=seed + attempt)
         yield found
@@ -215,8 +217,9 @@ def _finish(
         view = _view(scan, some)
         level = float(_tolerance(model, poses, some).min())
         total = evidence(model, poses, some, tolerance_mm=level, view=view).total
-        if init is not None:  # the pose near the guess is the one to judge
-            total[is_same(*distances(poses, found.pose(0), part), part)] += 10
+        if init is not None:  # the best of those near the guess is the one to judge
+            turn, shift = distances(poses, init, part)
+            total[(turn < GUESS_DEG) & (shift < GUESS_SHIFT * part.radius)] += 10
         order = np.argsort(-total, kind="stable")
         poses = select(poses, order[distinct(select(poses, order), part, len(order))])
     with _timed(seconds, "refine"):

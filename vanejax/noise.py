@@ -22,6 +22,7 @@ CUTOFF = 5.0  # standard deviations; a normal distribution has 6e-7 beyond
 # rays flatter than 88.9 deg count as if they were not: one of them would outweigh 1e6 others, and a
 # pose wrong by less than its noise would already make it jump off the face
 LEAST_COSINE = 0.02
+LEAST_MM = 1e-5  # what single precision leaves of 100 mm
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +60,7 @@ def fit_noise(residuals: Residuals) -> Noise:
     core = Noise(range_mm, lateral_mm, np.inf)
     standard = along / core.sigma_mm(cosine)
     freedom, scale = _student(standard[np.abs(standard) < 2 * CUTOFF])
-    return Noise(range_mm * scale, lateral_mm * scale, freedom)
+    return Noise(max(range_mm * scale, LEAST_MM), lateral_mm * scale, freedom)
 
 
 def weights(along: np.ndarray, cosine: np.ndarray, noise: Noise) -> np.ndarray:
@@ -80,7 +81,7 @@ def _spread(magnitude: np.ndarray, tangent_squared: np.ndarray) -> tuple[float, 
     """range_mm and lateral_mm from robust spreads in bins of equal size over the tangent."""
     order = np.argsort(tangent_squared)
     bins = [b for b in np.array_split(order, 12) if len(b)]
-    variance = np.array([(1.4826 * np.median(magnitude[b])) ** 2 for b in bins]) + 1e-12
+    variance = np.array([(1.4826 * np.median(magnitude[b])) ** 2 for b in bins]) + LEAST_MM**2
     steep = np.array([np.median(tangent_squared[b]) for b in bins])
     if np.ptp(steep) < 1e-6:
         return float(np.sqrt(np.median(variance))), 0.0
@@ -101,7 +102,7 @@ def _student(standard: np.ndarray) -> tuple[float, float]:
     by more than chance (a log likelihood of 5).
     """
     step = max(1, len(standard) // 5000)
-    squared = standard[::step] ** 2
+    squared = standard[::step] ** 2 + 1e-12  # a scan without noise has no logarithm
     if len(squared) < 30:
         return np.inf, 1.0
     best, best_likelihood = (np.inf, 1.0), -np.inf

@@ -166,10 +166,7 @@ def challengers(surface: Surface, best: RigidTransform) -> RigidTransform:
     diagonals between them, as parts have symmetries, about the middle of the surface; and shifted
     along the three axes by an eighth and a quarter of the length: the pitch of repeated features.
     """
-    points = surface.points
-    middle = points.mean(axis=0)
-    _, axes = np.linalg.eigh(np.cov((points - middle).T))
-    axes = axes.T
+    middle, axes = surface.moments
     turns = [axis * np.radians(angle) for axis in axes for angle in TURNS_DEG]
     for i, j in ((0, 1), (1, 2), (0, 2)):
         for sign in (1, -1):
@@ -177,7 +174,7 @@ def challengers(surface: Surface, best: RigidTransform) -> RigidTransform:
             turns.append(np.pi * diagonal)
     turn = Rotation.from_rotvec(np.stack(turns)).as_matrix()
     turned = RigidTransform(turn @ best.rotation, turn @ (best.translation - middle) + middle)
-    along = np.ptp((points - middle) @ axes.T, axis=0)
+    along = np.ptp(surface.points @ axes.T, axis=0)
     shifts = np.stack(
         [s * along[k] * axes[k] for k in range(3) for s in (0.125, -0.125, 0.25, -0.25)]
     )

@@ -23,7 +23,7 @@ MOST_POINTS = 400_000  # more of them improve the pose by less than the casting'
 # of the part's radius: no sensor worth the name is noisier, and no kernel starts narrower
 SCALE_FLOOR = 0.01
 NOISE_FITS = 4  # of the last stage's iterations
-SETTLED = 0.02  # of a standard deviation of the pose: a smaller step says nothing new
+SETTLED = 0.1  # of a standard deviation of the pose: a smaller step says nothing new
 
 
 def subset(points: np.ndarray, count: int, seed: int) -> np.ndarray:
@@ -159,13 +159,16 @@ def _polish(
     """Least squares along the rays, weighted by the noise that is fitted on the way."""
     patches = patches_of(model, points)
     converged = False
+    weight = np.full(len(points), np.inf)
     for step in range(max_iterations):
         now = model.residuals(batch, points)
         cosine = np.maximum(now.cosine[0], LEAST_COSINE)
         along = now.deviation_mm[0] / cosine
         if step < NOISE_FITS:  # then fixed: pose and noise would follow each other round
             noise = fit_noise(now)
-            weight = weights(along, cosine, noise)
+        fresh = weights(along, cosine, noise)
+        # a ray that was off once stays out: else those at edges would come and go for ever
+        weight = fresh if step < NOISE_FITS else np.minimum(weight, fresh)
         weighted = now.jacobian[0] * (weight / cosine)[:, None]
         scores = weighted * along[:, None]
         information = weighted.T @ (now.jacobian[0] / cosine[:, None])

@@ -32,7 +32,6 @@ T = TypeVar("T")
 # surface samples, or on the faces themselves; each is some ten times slower than the one before.
 Precision = Literal["grid", "samples", "faces"]
 BLOCK = 1 << 14  # rays at a time: their arrays stay in the cache
-MOST_EXACT = 20_000  # points; of more of them the samples will do
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -224,6 +223,4 @@ def _feet(surface: Surface, points: np.ndarray, precision: Precision) -> Feet:
     """Feet of points [m, 3] as near as wanted."""
     if precision == "grid":
         return surface.coarse(points)
-    if precision == "samples" or len(points) > MOST_EXACT:
-        return surface.nearest(points)
-    return surface.exact(points)
+    return surface.nearest(points) if precision == "samples" else surface.exact(points)

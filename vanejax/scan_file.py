@@ -114,15 +114,10 @@ def _millimetres(
             return 1000.0, (
                 f"taken as metres: {1000 * size:.4g} mm large, the part {diagonal:.4g} mm",
             )
-        others = [unit for unit in MM_PER_UNIT if fits(unit)]
-        advice = (
-            f"say --units-scan {others[0]} if it is in {others[0]}"
-            if others
-            else "crop it to the part, check the part's unit, or say --units-scan mm (or m)"
-        )
         raise InputError(
             f"{path}: the unit cannot be told: the scan is {size:.4g} mm large in millimetres and "
-            f"{1000 * size:.4g} mm in metres, the part {diagonal:.4g} mm; {advice}"
+            f"{1000 * size:.4g} mm in metres, the part {diagonal:.4g} mm; "
+            + _unit_advice(size, diagonal, [unit for unit in MM_PER_UNIT if fits(unit)])
         )
     scale = MM_PER_UNIT[units]
     ratio = size * scale / diagonal
@@ -135,6 +130,25 @@ def _millimetres(
             f"{path}: {found}; it looks like {others[0]}: say --units-scan {others[0]}"
         )
     return scale, (f"{found}: check both units",)
+
+
+def _unit_advice(size: float, diagonal: float, fitting: list[str]) -> str:
+    """What to say on the command line where neither millimetres nor metres fit the part.
+
+    The part's unit may be the wrong one: it is named where a scan in mm or m then covers the part
+    as a whole view of it does.
+    """
+    for unit, factor in MM_PER_UNIT.items():
+        covered = [scale * size / (factor * diagonal) for scale in (1.0, 1000.0)]
+        if unit != "mm" and any(0.4 <= share <= 1.1 for share in covered):
+            return (
+                f"say --units-cad {unit} if the part is in {unit} "
+                f"({factor * diagonal:.4g} mm large), "
+                + (f"--units-scan {fitting[0]} if the scan is" if fitting else "or check both")
+            )
+    if fitting:
+        return f"say --units-scan {fitting[0]} if it is in {fitting[0]}"
+    return "crop it to the part, check the part's unit, or say --units-scan mm (or m)"
 
 
 def save_points(

@@ -47,6 +47,22 @@ class Surface:
         self._tree = cKDTree(self.points)
 
     @functools.cached_property
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """The surface's middle [3], mm, and its principal axes [3, 3], unit, one in each row.
+
+        Exact integrals: over a triangle of area A with corners v and centroid m, that of x x^T is
+        ``A / 12 (sum v v^T + 9 m m^T)``.
+        """
+        corners = np.asarray(self.part.mesh.triangles, np.float64)
+        area = np.asarray(self.part.mesh.area_faces, np.float64)
+        centroid = corners.mean(axis=1)
+        middle = area @ centroid / area.sum()
+        corners, centroid = corners - middle, centroid - middle
+        second = np.einsum("f,fki,fkj->ij", area, corners, corners)
+        second += 9 * np.einsum("f,fi,fj->ij", area, centroid, centroid)
+        return middle, np.linalg.eigh(second)[1].T
+
+    @functools.cached_property
     def _grid(self) -> tuple[np.ndarray, float, np.ndarray]:
         """Lower corner, cell size, and a sample [x, y, z] in the occupied cell nearest to each."""
         low, high = np.asarray(self.part.mesh.bounds, np.float64)
