@@ -109,6 +109,13 @@ def test_the_verdict_comes_first(status, advice, reports):
     assert ("body", {"class": status}) in page.elements
 
 
+def test_ambiguous_without_another_pose_does_not_speak_of_one(tmp_path):
+    case = example_registration("ambiguous").replace(alternatives=())
+    text = Page(write(case, tmp_path)).text
+    assert "The scan does not fix the pose well enough." in text
+    assert "More than one pose" not in text
+
+
 def test_every_form_of_the_pose_is_the_pose(written):
     text = Page(written).text
     pose = example_registration().result.part_from_camera

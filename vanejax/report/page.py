@@ -169,7 +169,7 @@ def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransf
         result=result,
         scan=scan,
         part=part,
-        advice=_ADVICE[result.verdict.status],
+        advice=_advice(result),
         pose=_pose(result.part_from_camera),
         inverse=_pose(result.camera_from_part),
         shares=_shares(result),
@@ -197,6 +197,13 @@ def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransf
         script=script,
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
+
+
+def _advice(result: PoseResult) -> str:
+    """What to do, in a sentence."""
+    if result.verdict.status == "ambiguous" and not result.alternatives:
+        return "The scan does not fix the pose well enough. Do not machine before it is decided."
+    return _ADVICE[result.verdict.status]
 
 
 def _pose(transform: RigidTransform) -> _Pose:
