@@ -71,8 +71,21 @@ def test_each_fault_rejects_with_its_figure(reason):
 )
 def test_the_limit_itself_is_allowed(field, limit):
     worse = -1 if field == "inlier_share" else 1
-    assert verdict(**{field: limit - worse * 1e-9}).status == "accepted"
+    assert verdict(**{field: limit - worse * 1e-9}).status != "rejected"
     assert verdict(**{field: limit + worse * 1e-6}).status == "rejected"
+
+
+def test_weak_support_is_no_certainty():
+    """Another part that shares a corner fits 83 % of the points, 79 % of the surface."""
+    assert verdict(inlier_share=0.83, unmeasured_share=0.15).status == "accepted"
+    found = verdict(inlier_share=0.83, unmeasured_share=0.21)
+    assert found.status == "ambiguous"
+    assert "only 83% of the points" in found.reason
+    assert "21% of the surface" in found.reason
+    unknown = verdict(inlier_share=0.65, violation_share=np.nan, unmeasured_share=np.nan)
+    assert unknown.status == "ambiguous"
+    assert "surface" not in unknown.reason
+    assert verdict(inlier_share=0.72, unmeasured_share=np.nan).status == "accepted"
 
 
 def test_noise_is_doubtful_first_and_then_a_fault():
@@ -172,7 +185,9 @@ def test_a_weak_direction_is_ambiguous_and_named(axis, words):
         (Limits(least_preference=30.0), {}),
         (Limits(most_rotation_sigma_deg=1e-4), {}),
         (Limits(most_translation_sigma=1e-6), {}),
-        (Limits(least_inlier_share=0.2), {"inlier_share": 0.3}),
+        (Limits(least_support=0.99), {}),
+        (Limits(least_support=0.5), {"inlier_share": 0.62}),
+        (Limits(least_inlier_share=0.2, least_support=0.2), {"inlier_share": 0.3}),
         (Limits(most_violation_share=0.5), {"violation_share": 0.4}),
         (Limits(least_preference=-1.0), {"rivals": [rival(0.0)]}),
     ],

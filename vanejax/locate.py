@@ -132,18 +132,17 @@ def _locate(
     seconds: dict[str, float],
     counts: tuple[int, ...],
 ) -> PoseResult:
-    """Tries sources of poses, cheapest first, until one is not rejected."""
+    """Tries sources of poses, cheapest first, until one is well supported."""
     with _timed(seconds, "set up"):
         model = _model(scan, part)
     results = []
     for found in _sources(model, scan, init, weights, seed, seconds, counts):
         result = _finish(model, scan, found, init, limits, seed, seconds)
-        if result.verdict.status != "rejected":
-            return result
         results.append(result)
-    if init is not None:
-        return results[0]
-    return max(results, key=lambda result: result.verification.score)
+        well = result.verification.support >= (limits or Limits()).least_support
+        if well and result.verdict.status != "rejected":
+            return result
+    return max(results, key=lambda result: result.verification.support)
 
 
 def _model(scan: MeasuredScan, part: Part) -> MeasurementModel:

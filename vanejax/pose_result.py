@@ -115,6 +115,12 @@ class Verification:
     deviation_mm: np.ndarray
     score: float
 
+    @property
+    def support(self) -> float:
+        """What agrees on both sides: share of the points times share of the surface, 0 to 1."""
+        unmeasured = 0.0 if np.isnan(self.unmeasured_share) else self.unmeasured_share
+        return self.inlier_share * (1 - unmeasured)
+
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 from vanejax.pose_result import Refinement, Uncertainty, Verdict, Verification
@@ -23,6 +24,8 @@ class Limits:
         the pose is rejected.
       doubtful_noise: likewise; above it no pose is certain, since a sensor that is off by so much
         seldom is so at random.
+      least_support: `Verification.support`; below it no pose is certain: another part that shares
+        a corner with this one gets so far.
       least_inliers: points.
       least_preference: how many standard errors the patches of the scan must prefer the pose to
         each other pose that was tried.
@@ -35,6 +38,7 @@ class Limits:
     most_unmeasured_share: float = 0.35
     most_noise: float = 0.04
     doubtful_noise: float = 0.02
+    least_support: float = 0.7
     least_inliers: int = 40
     least_preference: float = 4.0
     most_rotation_sigma_deg: float = 1.0
@@ -79,6 +83,18 @@ def judge(
             f"the scan fits {_count(len(near))} nearly as well: one is turned by "
             f"{other.rotation_deg:.1f} deg and moved by {other.translation_mm:.2f} mm; "
             "a view that shows where they differ, or a rough pose, decides",
+        )
+    if verification.support < limits.least_support:
+        return Verdict(
+            "ambiguous",
+            f"only {verification.inlier_share:.0%} of the points lie on the part"
+            + (
+                ""
+                if math.isnan(verification.unmeasured_share)
+                else f", and {verification.unmeasured_share:.0%} of the surface that the sensor "
+                "should have seen was not measured"
+            )
+            + ": crop the scan to the part, and see that it is this part",
         )
     noise = verification.tolerance_mm / 3
     if noise > limits.doubtful_noise * radius_mm:
