@@ -159,11 +159,12 @@ def table(report: Mapping[str, Any]) -> str:
         lines.append(f"  {outcome.replace('_', ' '):<32}{cells}")
     for row in (*report["judged"], *report["registered"]):
         if row["verdict"] == "accepted" and not row["right"]:
-            lines.append(
-                f"ACCEPTED AND WRONG: {row['part']}, {row['sensor']}, "
-                f"{row.get('kind', 'register')}: {row['rotation_deg']:.2f} deg, "
-                f"{row['translation_mm']:.2f} mm"
-            )
+            found = row.get("kind", "register")
+            if found == OTHER_PART:
+                found = f"taken for {row['sought']}"
+            else:
+                found += f", {row['rotation_deg']:.2f} deg, {row['translation_mm']:.2f} mm off"
+            lines.append(f"ACCEPTED AND WRONG: {row['part']}, {row['sensor']}: {found}")
     return "\n".join(lines)
 
 

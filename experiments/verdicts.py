@@ -94,7 +94,7 @@ def assess(
     result = []
     for found in refined:
         pose = found.part_from_camera
-        tolerance = float(locate._tolerance(model, _batch([pose]), some)[0])
+        tolerance = float(locate.inlier_tolerance_mm(model, _batch([pose]), some)[0])
         turn, shift = distances(poses, pose, part)
         others = np.flatnonzero(~is_same(turn, shift, part))
         compared = concatenate(_batch([pose]), select(poses, others))
@@ -128,14 +128,14 @@ def judged_poses(scan: PosedScan, model: RayCasting, seed: int) -> Iterator[dict
         yield _row(scan, kinds[k], found, right=scan.is_right(found.part_from_camera))
 
 
-def other_part(scan: PosedScan, model: RayCasting, seed: int) -> dict[str, Any]:
-    """A row for the best pose that a part finds in the scan of another one."""
+def other_part(scan: PosedScan, name: str, model: RayCasting, seed: int) -> dict[str, Any]:
+    """A row for the best pose that the part of that name finds in the scan of another one."""
     found = search(model, scan.points, count=OTHER_PART_STARTS, seed=seed)
     found = challenge(model, scan.points, found, seed=seed)
     best, *others = (found.pose(k) for k in range(min(len(found), 1 + locate.RIVALS)))
     refined = refine(model, scan.points, best, seed=seed)
     (assessed,) = assess(model, scan.points, [refined], rivals=others)
-    return _row(scan, OTHER_PART, assessed, right=False)
+    return _row(scan, OTHER_PART, assessed, right=False) | {"sought": name}
 
 
 def registered(scan: PosedScan, seed: int) -> dict[str, Any]:
@@ -208,7 +208,7 @@ def measure(settings: argparse.Namespace) -> tuple[list[dict[str, Any]], list[di
         judged += judged_poses(scan, models[scan.name], settings.seed)
         runs.append(registered(scan, settings.seed))
         for other in other_parts(place, list(parts)):
-            judged.append(other_part(scan, models[other], settings.seed))
+            judged.append(other_part(scan, other, models[other], settings.seed))
     return judged, runs
 
 

@@ -36,6 +36,7 @@ from vanejax.pose_search import (
 )
 from vanejax.residuals import SurfaceMatching
 from vanejax.rigid import RigidTransform
+from vanejax.verification import Evidence
 
 IDENTITY = RigidTransform(np.eye(3), np.zeros(3))
 
@@ -268,3 +269,17 @@ def test_every_pose_of_a_search_is_rigid():
     for rotation in found.part_from_camera.rotation:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
         assert np.linalg.det(rotation) > 0
+
+
+def test_a_challenge_keeps_the_best_even_where_nothing_fits(monkeypatch):
+    """Where every score is negative, a share of the best one is above it."""
+
+    def nothing_fits(model, poses, points, *, tolerance_mm, view):
+        count = len(poses.rotation)
+        return Evidence(np.zeros(1), np.zeros((count, 1)), -np.linspace(0.1, 0.9, count))
+
+    monkeypatch.setattr("vanejax.pose_search.evidence", nothing_fits)
+    points, pose = measured_points(box(), random_view(box(), seed=3))
+    kept = challenge(model(box()), points, Candidates(batch(pose), np.array([-0.5])))
+    assert kept.score[0] == -0.1
+    assert (kept.score >= -0.1 * 1.4 - 1e-12).all()

@@ -167,14 +167,14 @@ def test_jacobian_of_rays_against_finite_differences(seed):
 def test_a_ray_that_misses_has_its_distance_to_the_surface(feet):
     part = box()
     pose = pointing_at(part, [0, 0, 300])
-    # 20 mm outside the box's +x side, whose face lies at x = 47 mm
-    target = np.array([[67.0, y, z] for y in (-20, -4, 10) for z in (0.0, 11.0, 20.0)])
+    # 3 mm outside the box's +x side, whose face lies at x = 47 mm
+    target = np.array([[50.0, y, z] for y in (-20, -4, 10) for z in (11.0, 16.0, 22.0)])
     points = pose.inverse().apply(target)
     now = model(part).residuals(batch(pose), points, feet=feet)
     assert not now.hit.any()
     within = {"faces": 1e-5, "samples": 1.0, "grid": 9.0}[feet]  # cells of 3.3 mm, 2 sqrt(3) / 2
-    np.testing.assert_allclose(now.deviation_mm[0], 20.0, atol=within)
-    assert (now.deviation_mm >= 20 - 1e-5).all()  # no sample is nearer than the surface
+    np.testing.assert_allclose(now.deviation_mm[0], 3.0, atol=within)
+    assert (now.deviation_mm >= 3 - 1e-5).all()  # no sample is nearer than the surface
     np.testing.assert_allclose(np.linalg.norm(now.jacobian[0, :, 3:], axis=1), 1, atol=1e-12)
     assert (now.jacobian[0, :, 3] > 0.7).all()  # away from the surface: +x
     np.testing.assert_array_equal(now.cosine, 1.0)
@@ -212,13 +212,23 @@ def test_misses_are_measured_between_the_surface_and_its_samples():
     part = box()
     pose = pointing_at(part, [0, 0, 300])
     rng = np.random.default_rng(0)
-    target = rng.uniform([60, -25, 0], [70, 15, 20], (3_000, 3))
+    target = rng.uniform([49.5, -25, 12], [50, 15, 22], (3_000, 3))
     points = pose.inverse().apply(target)
     now = model(part).residuals(batch(pose), points)
     assert not now.hit.any()
     nearest = model(part).surface.nearest(target)
     assert (now.deviation_mm[0] < np.linalg.norm(target - nearest.points, axis=1) + 1e-9).all()
     assert (now.deviation_mm[0] > target[:, 0] - 47 - 1e-5).all()
+
+
+def test_a_ray_that_misses_by_far_has_about_its_distance():
+    """Beyond 15 % of the radius a grid cell's foot will do: it weighs nothing."""
+    part = box()
+    pose = pointing_at(part, [0, 0, 300])
+    points = pose.inverse().apply(np.array([[47 + 30.0, 0, 10], [47 + 60.0, -4, 10]]))
+    now = model(part).residuals(batch(pose), points, feet="faces")
+    assert not now.hit.any()
+    np.testing.assert_allclose(now.deviation_mm[0], [30, 60], atol=3.0)
 
 
 # --- surface ------------------------------------------------------------------------------------

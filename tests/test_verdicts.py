@@ -179,7 +179,7 @@ def test_what_is_reported() -> None:
         judged(RIGHT, 0.6, "ambiguous", right=True),
         judged("turned", 0.7, "rejected"),
         judged("turned", 0.2, "rejected"),
-        judged(OTHER_PART, 0.3, "accepted"),
+        judged(OTHER_PART, 0.3, "accepted") | {"sought": "gear"},
     ]
     runs = [
         run("accepted", right=True),
@@ -210,7 +210,8 @@ def test_what_is_reported() -> None:
         "rejected_wrong": 1,
     }
     words = table(report)
-    assert words.count("ACCEPTED AND WRONG") == 2
+    assert "ACCEPTED AND WRONG: p, white: taken for gear" in words
+    assert "ACCEPTED AND WRONG: p, white: register, 1.00 deg, 1.00 mm off" in words
     assert "verification score" in words
     picture(report).canvas.draw()
 

@@ -214,7 +214,7 @@ def _finish(
             settled_deg=0.02,
         )
         view = _view(scan, some)
-        level = float(_tolerance(model, poses, some).min())
+        level = float(inlier_tolerance_mm(model, poses, some).min())
         total = evidence(model, poses, some, tolerance_mm=level, view=view).total
         if init is not None:  # the best of those near the guess is the one to judge
             turn, shift = distances(poses, init, part)
@@ -226,7 +226,7 @@ def _finish(
         pose = refinement.part_from_camera
     with _timed(seconds, "verify"):
         poses = concatenate(_batch(pose), select(poses, slice(1, None)))
-        tolerance = float(_tolerance(model, _batch(pose), some)[0])
+        tolerance = float(inlier_tolerance_mm(model, _batch(pose), some)[0])
         said = evidence(model, poses, some, tolerance_mm=tolerance, view=view)
         checked = subset(points, VERIFIED_POINTS, seed + 3)
         verification = verify(
@@ -293,7 +293,9 @@ def _alternative(
     )
 
 
-def _tolerance(model: MeasurementModel, poses: RigidTransform, points: np.ndarray) -> np.ndarray:
+def inlier_tolerance_mm(
+    model: MeasurementModel, poses: RigidTransform, points: np.ndarray
+) -> np.ndarray:
     """[H] largest deviation of an inlier, mm: three robust standard deviations, within bounds."""
     radius = model.part.radius
     level = 3 * noise_level(model, poses, points)

@@ -201,7 +201,8 @@ def challenge(
     score = evidence(model, every, few, tolerance_mm=tolerance, view=view).total
     order = np.argsort(-score, kind="stable")
     order = order[distinct(select(every, order), model.part, CHALLENGED)]
-    order = order[score[order] >= HOPELESS * score[order[0]]]
+    best = score[order[0]]
+    order = order[score[order] >= best - (1 - HOPELESS) * abs(best)]
     return Candidates(select(every, order), score[order])
 
 

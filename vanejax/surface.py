@@ -32,6 +32,11 @@ class Feet:
     normals: np.ndarray
     face: np.ndarray
 
+    def put(self, which: np.ndarray, better: Feet) -> None:
+        """Takes the feet of the points of the indices ``which`` from ``better``."""
+        self.points[which], self.normals[which] = better.points, better.normals
+        self.face[which] = better.face
+
 
 class Surface:
     """Nearest points on a part's surface. Safe to share between threads.
