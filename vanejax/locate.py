@@ -46,7 +46,7 @@ VERIFIED_POINTS = 100_000
 # than the second is not on the part
 LEAST_TOLERANCE, MOST_TOLERANCE = 0.001, 0.12
 REACH = 0.3  # of the part's radius: how far a surface partner is sought where no ray is known
-# one search more with twice the starts where the first ends in a rejection
+# one search more with twice the starts where the first finds no well supported pose
 STARTS = (400, 800)
 # a guess is good to this; a pose farther away that fits as well is no reason to doubt it
 GUESS_DEG, GUESS_SHIFT = 30.0, 0.3
@@ -105,7 +105,7 @@ def register(
                 scan, units=units_scan, part_extent_mm=part.extent_mm, sensor_origin=sensor_origin
             )
     result = _locate(scan, part, init, weights, limits, seed, seconds, STARTS)
-    if scan.origin_is_assumed and result.verdict.status == "rejected":
+    if scan.origin_is_assumed and not _is_sound(result, limits):
         # perhaps the cloud was moved after it was taken: then the rays are wrong, not the pose
         merged = dataclasses.replace(
             scan,
@@ -138,11 +138,16 @@ def _locate(
     results = []
     for found in _sources(model, scan, init, weights, seed, seconds, counts):
         result = _finish(model, scan, found, init, limits, seed, seconds)
-        results.append(result)
-        well = result.verification.support >= (limits or Limits()).least_support
-        if well and result.verdict.status != "rejected":
+        if _is_sound(result, limits):
             return result
+        results.append(result)
     return max(results, key=lambda result: result.verification.support)
+
+
+def _is_sound(result: PoseResult, limits: Limits | None) -> bool:
+    """Whether a pose explains the scan so well that no other source of poses need be tried."""
+    least = (limits or Limits()).least_support
+    return result.verdict.status != "rejected" and result.verification.support >= least
 
 
 def _model(scan: MeasuredScan, part: Part) -> MeasurementModel:
