@@ -70,18 +70,29 @@ def header(method: str, settings: argparse.Namespace, part: Part | None = None) 
 
 
 def save(folder: Path, name: str, report: dict[str, Any]) -> dict[str, Any]:
-    """Writes ``name``.json; returns what it holds, with None for what is not finite.
+    """Writes ``name``.json; returns what it holds: six digits, and None for what is not finite.
 
     Raises:
       InputError: the folder cannot be written.
     """
-    report = plain(report)
+    report = _rounded(plain(report))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / f"{name}.json", report)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
     return report
+
+
+def _rounded(value: Any) -> Any:
+    """The same with six significant digits: more of a measured figure is noise."""
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, dict):
+        return {name: _rounded(entry) for name, entry in value.items()}
+    if isinstance(value, list):
+        return [_rounded(entry) for entry in value]
+    return value
 
 
 def positive_numbers(text: str) -> tuple[float, ...]:

@@ -6,7 +6,7 @@ Each part is scanned by each sensor from random rotations. The true pose and wro
 off, upside down, nearly symmetric, turned by 10 to 180 deg) are refined, and the part is sought in
 the scan of another one; every pose that results is verified and judged as `vanejax.register` does,
 against the others as rivals. Then `vanejax.register` itself is run from no guess. Results: tables,
-verdicts.json and verdicts.png in ``--out``.
+verdicts.json, verdicts.png and judged.json (every pose) in ``--out``.
 """
 
 from __future__ import annotations
@@ -233,7 +233,11 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     judged, runs = measure(settings)
     method = "poses judged by ray casting"
     summary = summarize(judged, runs)
-    report = study.save(settings.out, "verdicts", study.header(method, settings) | summary)
+    head = study.header(method, settings)
+    # a thousand poses beside the figures that sum them up
+    study.save(settings.out, "judged", head | {"judged": summary["judged"]})
+    figures = {name: value for name, value in summary.items() if name != "judged"}
+    report = study.save(settings.out, "verdicts", head | figures)
     save_figure(picture(summary), settings.out / "verdicts.png")
     print(table(summary))
     return report
