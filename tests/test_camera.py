@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from vanejax.camera import Camera, field_of_view_deg, hemisphere_viewpoints, look_at
@@ -104,6 +104,7 @@ def test_impossible_cameras_are_refused(wrong):
 
 @settings(max_examples=200, deadline=None)
 @given(position=points, target=points, shift=points)
+@example(position=np.array([0.0, 62.0, -6.103515625e-05]), target=np.zeros(3), shift=np.zeros(3))
 def test_look_at_laws(position, target, shift):
     distance = np.linalg.norm(position - target)
     if distance < 1e-3:
@@ -115,7 +116,8 @@ def test_look_at_laws(position, target, shift):
     scale = 1e-12 * 4e3  # relative f64 error x largest coordinate
     np.testing.assert_allclose(pose.apply(target[None])[0], (0, 0, -distance), atol=scale)
     np.testing.assert_allclose(pose.apply(position[None])[0], 0, atol=scale)
-    assert rotation[1, 1] >= -1e-9  # up stays up, also in the fallback along y
+    # up stays up; the fallback serves sights within 1e-6 of the y axis, and may lean by as much
+    assert rotation[1, 1] >= -1.001e-6
     if abs(rotation[2, 1]) < 0.9999:  # away from the fallback, moving the scene turns nothing
         moved = look_at(position + shift, target + shift)
         # sums of 1e3 mm round to 2e-13, over the least distance 1e-3 and sin(D, y) 0.014
