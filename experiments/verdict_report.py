@@ -177,7 +177,10 @@ def picture(report: Mapping[str, Any]) -> Figure:
         label = f"{FIGURES[name]}: {report['figures'][name]['auc']:.3f}"
         curves.step(*roc(right, wrong), where="post", color=color, label=label)
     curves.plot([0, 1], [0, 1], ":", color=FAINT)
-    curves.legend(frameon=False, fontsize=9, labelcolor=INK, title="area under the curve")
+    curves.legend(
+        loc="lower right", fontsize=8, labelcolor=INK, title="area under the curve",
+        title_fontsize=9, framealpha=0.9, edgecolor="none",
+    )  # fmt: skip
     style_chart(
         curves, title="right against wrong poses", xlabel="wrong poses accepted",
         ylabel="right poses accepted",
