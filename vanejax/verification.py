@@ -15,7 +15,7 @@ import dataclasses
 import numpy as np
 
 from vanejax.pose_result import PointStatus, Verification
-from vanejax.residuals import MeasurementModel, RayCasting
+from vanejax.residuals import MeasurementModel, RayCasting, Residuals
 from vanejax.rigid import RigidTransform
 
 MOST_CELLS = 64  # along the longer side of the scan's view
@@ -142,12 +142,8 @@ def evidence(
     that it should hold. ``view`` must be of these very points, or None where no ray is known.
     """
     now = model.residuals(poses, points, feet="samples")
-    score = np.clip(1 - (now.deviation_mm / tolerance_mm) ** 2, 0, None)
-    if view is None:
-        label = _cubes(points)
-    else:
-        label = view.patch
-        score[now.hit & (now.deviation_mm < -tolerance_mm)] = -VIOLATION_PENALTY
+    score = _point_scores(now, tolerance_mm, view)
+    label = _cubes(points) if view is None else view.patch
     labels = [label]
     missing = []
     for h in range(len(poses.rotation)):
@@ -204,12 +200,13 @@ def verify(
     status[np.abs(deviation) <= tolerance_mm] = PointStatus.INLIER
     inlier = status == PointStatus.INLIER
     unmeasured = violation = np.nan
+    score = _point_scores(now, tolerance_mm, view).sum()
     if view is not None:
         violation = float(np.mean(status == PointStatus.BEHIND))
         _, _, seen = predicted_unmeasured(model, part_from_camera, view)
         measured = inlier.sum() / view.points_per_cell
         unmeasured = float(seen.sum() / max(seen.sum() + measured, 1.0))
-    judged = evidence(model, batch, points[checked], tolerance_mm=tolerance_mm, view=view)
+        score -= UNMEASURED_PENALTY * view.points_per_cell * seen.sum()
     return Verification(
         inlier_share=float(inlier.mean()),
         violation_share=violation,
@@ -218,8 +215,16 @@ def verify(
         checked=checked,
         status=status,
         deviation_mm=np.where(hit | inlier, deviation, np.nan),
-        score=float(judged.total[0]),
+        score=float(score / len(checked)),
     )
+
+
+def _point_scores(now: Residuals, tolerance_mm: float, view: View | None) -> np.ndarray:
+    """[H, n], as `evidence` says; nothing is behind where no ray is known."""
+    score = np.clip(1 - (now.deviation_mm / tolerance_mm) ** 2, 0, None)
+    if view is not None:
+        score[now.hit & (now.deviation_mm < -tolerance_mm)] = -VIOLATION_PENALTY
+    return score
 
 
 def _cubes(points: np.ndarray) -> np.ndarray:
