@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import numpy as np
 import pytest
+import trimesh
 from example_scans import (
     MIDDLE,
     batch,
@@ -26,13 +28,13 @@ from scipy.spatial.transform import Rotation
 
 import vanejax
 from vanejax import locate
-from vanejax.camera import Camera
+from vanejax.camera import Camera, look_at
 from vanejax.errors import InputError
 from vanejax.locate import register
 from vanejax.measured_scan import clean_scan
 from vanejax.model_file import TrainedMatcher
 from vanejax.pairs import Drawing
-from vanejax.part import Part
+from vanejax.part import Part, part_from_mesh
 from vanejax.pose_result import PoseResult
 from vanejax.rigid import RigidTransform
 from vanejax.scan_file import save_points
@@ -472,3 +474,39 @@ def test_clutter_around_the_part_is_said_to_be_none_of_it():
     status = result.verification.status[np.argsort(result.verification.checked)]
     assert (status[len(points) :] != 0).mean() > 0.95
     assert aside.sum() > 100
+
+
+def test_the_pose_near_the_guess_is_judged_though_a_far_one_fits_better():
+    """A box with a boss at one end, guessed end for end: the far pose is named, not returned."""
+    boss = trimesh.creation.box(bounds=[[20, -10, 15], [34, 10, 24]])
+    solid = trimesh.boolean.union([trimesh.creation.box((80.0, 50.0, 30.0)), boss])
+    part = part_from_mesh(solid.vertices, solid.faces, name="bossed box")
+    view = look_at(np.array([135.0, 180.0, 390.0]), part.center)
+    points, truth = measured_points(part, view)
+    guess = motion(part, [0, 0, 180.0], np.zeros(3)) @ truth
+    result = register(points, part, init=guess)
+    turned, moved_by = pose_error(part, result.part_from_camera, guess)
+    assert turned < locate.GUESS_DEG
+    assert moved_by < locate.GUESS_SHIFT * part.radius
+    assert result.verdict.status == "ambiguous"
+    nearest = min(pose_error(part, a.part_from_camera, truth)[0] for a in result.alternatives)
+    assert nearest < 0.5  # the true pose, followed with a part of the points
+
+
+@pytest.mark.parametrize("second", [0.9, 0.6, 0.3])
+def test_a_weakly_supported_pose_is_no_reason_to_stop(second, monkeypatch):
+    """The next source is asked, and the better supported of all is the answer."""
+    good = found_bracket()
+
+    def supported(share: float) -> PoseResult:
+        shares = {"inlier_share": share, "unmeasured_share": 0.0}
+        return dataclasses.replace(
+            good, verification=dataclasses.replace(good.verification, **shares)
+        )
+
+    results = {0.5: supported(0.5), second: supported(second)}
+    monkeypatch.setattr(locate, "_sources", lambda *_: iter([0.5, second]))
+    monkeypatch.setattr(locate, "_finish", lambda model, scan, found, *_: results[found])
+    points, _ = scan_of("bracket", 1)
+    found = register(points, bracket(), sensor_origin=np.zeros(3))
+    assert found is results[max(0.5, second)]

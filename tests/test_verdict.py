@@ -137,6 +137,12 @@ def test_the_nearest_rival_is_named_and_all_are_counted():
     assert "45.0 deg" in found.reason
 
 
+def test_a_rival_that_fits_better_is_called_so():
+    limit = Limits().least_preference
+    assert "another pose better: one is turned" in verdict(rivals=[rival(-limit - 0.1)]).reason
+    assert "another pose nearly as well" in verdict(rivals=[rival(-limit)]).reason
+
+
 def test_the_threshold_of_preference():
     limit = Limits().least_preference
     assert verdict(rivals=[rival(limit)]).status == "accepted"

@@ -80,7 +80,9 @@ def judge(
         other = min(near, key=lambda rival: rival.preference)
         return Verdict(
             "ambiguous",
-            f"the scan fits {_count(len(near))} nearly as well: one is turned by "
+            f"the scan fits {_count(len(near))} "
+            + ("better" if other.preference < -limits.least_preference else "nearly as well")
+            + ": one is turned by "
             f"{other.rotation_deg:.1f} deg and moved by {other.translation_mm:.2f} mm; "
             "a view that shows where they differ, or a rough pose, decides",
         )
