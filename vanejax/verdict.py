@@ -78,10 +78,11 @@ def judge(
     near = [rival for rival in rivals if rival.preference < limits.least_preference]
     if near:
         other = min(near, key=lambda rival: rival.preference)
+        better = "better" if len(near) == 1 else "as well or better"
         return Verdict(
             "ambiguous",
             f"the scan fits {_count(len(near))} "
-            + ("better" if other.preference < -limits.least_preference else "nearly as well")
+            + (better if other.preference < -limits.least_preference else "nearly as well")
             + ": one is turned by "
             f"{other.rotation_deg:.1f} deg and moved by {other.translation_mm:.2f} mm; "
             "a view that shows where they differ, or a rough pose, decides",
