@@ -15,6 +15,7 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from experiments.experiment import Experiment
+from vanejax import compilation_cache
 from vanejax.errors import InputError
 
 CONFIG_FOLDER = Path(__file__).parent / "configs"
@@ -47,7 +48,10 @@ def workdir(given: flags.FlagHolder, config: flags.FlagHolder) -> Path:
 
 
 def run(main: Callable[[], int | None]) -> None:
-    """Parses the command line, runs ``main`` and exits: 0, or 2 where the input is at fault."""
+    """Parses the command line, runs ``main`` and exits: 0, or 2 where the input is at fault.
+
+    Compiled programs are kept: `vanejax.compilation_cache`.
+    """
     # jaxlib announces things about TPUs and GPUs that are not there
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
@@ -58,6 +62,7 @@ def run(main: Callable[[], int | None]) -> None:
                 raise InputError(f"no such argument: {' '.join(rest[1:])}; see --help")
             if flags.FLAGS.config is None:
                 raise InputError("--config is missing; try --config vane.py, or --help")
+            compilation_cache.enable()
             return main() or 0
         except InputError as error:
             print(f"error: {error}", file=sys.stderr)

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 
 from experiments.report import plain
 from experiments.run_folder import git_commit, versions, write_json
+from vanejax import compilation_cache
 from vanejax.errors import InputError
 from vanejax.part import Part
 
@@ -22,6 +23,8 @@ def make_parser(name: str, description: str | None) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=f"python -m experiments.{name}",
         description=description,
+        epilog=f"{compilation_cache.VARIABLE} is where compiled programs are kept "
+        "(~/.cache/vanejax); off keeps none",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
@@ -33,10 +36,14 @@ def make_parser(name: str, description: str | None) -> argparse.ArgumentParser:
 
 
 def run(main: Callable[[argparse.Namespace], object], parser: argparse.ArgumentParser) -> NoReturn:
-    """Parses the command line, runs ``main`` and exits: 0, or 2 where the input is at fault."""
+    """Parses the command line, runs ``main`` and exits: 0, or 2 where the input is at fault.
+
+    Compiled programs are kept: `vanejax.compilation_cache`.
+    """
     # jaxlib announces things about TPUs and GPUs that are not there
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     settings = parser.parse_args()
+    compilation_cache.enable()
     try:
         main(settings)
     except InputError as error:

@@ -4,6 +4,8 @@ python -m experiments.train --config vane.py [--workdir runs/vane] [--config.FIE
 
 Makes the part, scans it from every viewpoint, trains, and registers the test views. Kill it and
 start it again: it goes on where its last checkpoint stands and ends bit-equal.
+
+VANEJAX_CACHE_DIR is where compiled programs are kept (~/.cache/vanejax); off keeps none.
 """
 
 from __future__ import annotations

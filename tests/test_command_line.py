@@ -1,5 +1,6 @@
 """Command lines: config look-up, overrides and their errors, seen as a user sees them."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,9 +13,15 @@ from vanejax.errors import InputError
 ROOT = Path(__file__).parents[1]
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "experiments.train", *arguments]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.train", *arguments],
+        cwd=ROOT,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
 
 
 def test_a_bare_name_is_found_here_first_and_then_in_the_package(tmp_path, monkeypatch) -> None:
@@ -68,4 +75,14 @@ def test_help_names_the_config_and_the_workdir() -> None:
     assert "--config" in text
     assert "smoke.py" in text
     assert "--workdir" in text
+    assert "VANEJAX_CACHE_DIR" in text
     assert "Traceback" not in text
+
+
+def test_compiled_programs_are_kept_where_the_user_says(tmp_path) -> None:
+    cache, workdir = tmp_path / "cache", str(tmp_path / "run")
+    wrong = ["--config", "smoke.py", "--config.data.noise=-1", "--workdir", workdir]
+    assert run(*wrong, VANEJAX_CACHE_DIR=str(cache)).returncode == 2
+    assert cache.is_dir()  # made before the settings were looked at
+    assert run(*wrong, VANEJAX_CACHE_DIR="off", XDG_CACHE_HOME=str(tmp_path)).returncode == 2
+    assert not (tmp_path / "vanejax").exists()

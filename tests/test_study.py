@@ -50,6 +50,17 @@ def test_faults_of_the_input_are_one_line(monkeypatch: pytest.MonkeyPatch, capsy
     assert run(monkeypatch, lambda settings: {"a": "report"}) == 0
 
 
+def test_compiled_programs_are_kept_where_the_user_says(
+    monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    enabled = []
+    monkeypatch.setattr(study.compilation_cache, "enable", lambda: enabled.append(True))
+    assert run(monkeypatch, lambda settings: enabled.append(False)) == 0
+    assert enabled == [True, False]  # before anything is compiled
+    assert run(monkeypatch, print, "--help") == 0
+    assert "VANEJAX_CACHE_DIR" in capsys.readouterr().out
+
+
 def test_a_report_says_where_it_comes_from(tmp_path: Path) -> None:
     settings = study.make_parser("name", "words").parse_args(["--out", str(tmp_path / "new")])
     header = study.header("a method", settings)
