@@ -6,6 +6,8 @@ Needs what ``experiments.train`` left in the work folder: the scans and a checkp
 the network shows by changing what it is tested with, results kept apart by ``--out``:
 ``--config.data.noise=0``, ``--config.data.num_reference=2048``,
 ``--config.model.test_iterations=2``, and another ``--config.seed`` for other points, noise, poses.
+
+VANEJAX_CACHE_DIR is where compiled programs are kept (~/.cache/vanejax); off keeps none.
 """
 
 from __future__ import annotations
@@ -22,13 +24,13 @@ from absl import flags
 
 from experiments import command_line, pictures
 from experiments.experiment import Experiment
-from experiments.registrations import register_views
+from experiments.registrations import Results, register_views
 from experiments.report import hardest_views, plain, summarize, table
 from experiments.run_folder import RunFolder, git_commit, read_log, versions, write_json
 from vanejax.checkpoint import Checkpoints
 from vanejax.dataset import ScanSet, describe_source, load_scan_set
 from vanejax.errors import InputError
-from vanejax.models.rpmnet import rpmnet
+from vanejax.models.rpmnet import RpmNet, rpmnet
 from vanejax.pairs import make_bank
 from vanejax.part import Part
 from vanejax.registration import Register, Registration
@@ -63,18 +65,40 @@ def evaluate(
       InputError: there are no test views.
     """
     test = scans.test
+    results = registered(config, scans, variables, progress=progress)
+    report = report_of(config, scans, results)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "evaluation.json", report)
+    pictures.draw(results, test, hardest_views(test), log, folder)
+    if part is not None:
+        pictures.draw_with_part(results, test, hardest_views(test), part, config, folder)
+    print(table(report))
+    return report
+
+
+def registered(
+    config: Experiment, scans: ScanSet, variables: Variables, *, progress: bool = True
+) -> Results:
+    """The registrations of the test views; see `evaluate`.
+
+    Raises:
+      InputError: there are no test views.
+    """
+    test = scans.test
     if not len(test):
         raise InputError("no test views: none of config.views.azimuths_deg is a multiple of 40 deg")
-    bank = make_bank(test, num_reference=config.data.num_reference)
-    register = make_register(config, variables)
-    results = register_views(
-        register,
-        bank,
+    return register_views(
+        make_register(config, variables),
+        make_bank(test, num_reference=config.data.num_reference),
         config.make_drawing(scans),
         seed=config.seed,
         unit_mm=scans.radius_mm,
         progress=progress,
     )
+
+
+def report_of(config: Experiment, scans: ScanSet, results: Results) -> dict[str, Any]:
+    """What evaluation.json holds of the registrations of the test views."""
     report = {
         "method": f"RPM-Net, {config.model.test_iterations} iterations, no initial guess",
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -85,26 +109,18 @@ def evaluate(
         "seed": config.seed,
         "config": dataclasses.asdict(config),
     }
-    report = plain(report | summarize(results, test))
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "evaluation.json", report)
-    pictures.draw(results, test, hardest_views(test), log, folder)
-    if part is not None:
-        pictures.draw_with_part(results, test, hardest_views(test), part, config, folder)
-    print(table(report))
-    return report
+    return plain(report | summarize(results, scans.test))
 
 
 def make_register(config: Experiment, variables: Variables) -> Register:
     """RPM-Net as configured for tests, jitted once for all views."""
-    model, iterations = config.make_model(), config.model.test_iterations
+    return functools.partial(_run, config.make_model(), config.model.test_iterations, variables)
 
-    # variables are an argument: as constants of the program they would be folded at compile time
-    @jax.jit
-    def run(variables: Variables, *pair_and_key: Any) -> Registration:
-        return rpmnet(model, variables, iterations=iterations)(*pair_and_key)
 
-    return functools.partial(run, variables)
+# variables are an argument: as constants of the program they would be folded at compile time
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _run(model: RpmNet, iterations: int, variables: Variables, *pair_and_key: Any) -> Registration:
+    return rpmnet(model, variables, iterations=iterations)(*pair_and_key)
 
 
 def load_variables(
