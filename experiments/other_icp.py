@@ -11,15 +11,15 @@ from vanejax.rigid import RigidTransform
 
 SAMPLES = 100_000  # of the CAD surface
 REACH_MM, MOST_ITERATIONS = 10.0, 50
+OPEN3D_ICP, SMALL_GICP = "Open3D ICP, point to plane", "small_gicp, point to plane"
 
 
 def open3d_icp(bench: Bench) -> Figure:
     """Point-to-plane ICP to samples of the CAD surface; the samples' tree is not timed."""
-    name = "Open3D ICP, point to plane"
     try:
         import open3d
     except ImportError as error:
-        return Figure(name, [], "refine", note=f"skipped: {error}")
+        return Figure(OPEN3D_ICP, [], note=f"skipped: {error}")
 
     surface, normals, _ = bench.views.part.sample(SAMPLES, seed=0)
     target, source = open3d.geometry.PointCloud(), open3d.geometry.PointCloud()
@@ -38,16 +38,15 @@ def open3d_icp(bench: Bench) -> Figure:
         )
     )
     pose = RigidTransform.from_matrix(np.asarray(found.transformation))
-    return Figure(name, seconds, against="refine", note=bench.error(pose))
+    return Figure(OPEN3D_ICP, seconds, note=bench.error(pose))
 
 
 def small_gicp_icp(bench: Bench) -> Figure:
     """The same with small_gicp, on all cores; its normals come from the samples around."""
-    name = "small_gicp, point to plane"
     try:
         import small_gicp
     except ImportError as error:
-        return Figure(name, [], "refine", note=f"skipped: {error}")
+        return Figure(SMALL_GICP, [], note=f"skipped: {error}")
 
     surface, _, _ = bench.views.part.sample(SAMPLES, seed=0)
     target = small_gicp.PointCloud(surface)
@@ -69,4 +68,4 @@ def small_gicp_icp(bench: Bench) -> Figure:
         )
     )
     pose = RigidTransform.from_matrix(np.asarray(found.T_target_source))
-    return Figure(name, seconds, against="refine", note=bench.error(pose))
+    return Figure(SMALL_GICP, seconds, note=bench.error(pose))

@@ -1,11 +1,11 @@
-"""How things are timed: the scan that all timings share, repeats, ratios, a table."""
+"""How things are timed: what all timings share, repeats, peers and limits, a table."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from vanejax.model_file import TrainedMatcher, load_model
 from vanejax.rigid import RigidTransform
 
 NOISE_MM, START_DEG, START_MM = 0.1, 5.0, 5.0
+LONG_S = 10.0  # from here on compilation and cold caches hardly count
 PIXELS = 128  # across, of the scans that are only counted
 
 
@@ -28,14 +29,18 @@ class Figure:
     Attributes:
       name: of it, unique.
       seconds: of each repeat, warm unless the note says otherwise; empty where it was skipped.
-      against: name of the figure that its median is divided by.
+      peers: names of figures of other programs that do the same; with each, how many times faster
+        than it this is to be, or None where nothing is asked.
+      limits: names of figures that are the least this could take; with each, how many times as
+        long this may take, or None.
       goal_s: what the median should not exceed on two cores.
       note: what else there is to say, such as the pose's error, or why it was skipped.
     """
 
     name: str
     seconds: Sequence[float]
-    against: str | None = None
+    peers: Mapping[str, float | None] = dataclasses.field(default_factory=dict)
+    limits: Mapping[str, float | None] = dataclasses.field(default_factory=dict)
     goal_s: float | None = None
     note: str = ""
 
@@ -48,12 +53,14 @@ class Bench:
       repeats: of each timing.
       seed: of noise and rough pose.
       weights: file of a trained matcher for the guide vane, or None.
+      large: whether sizes that take minutes are wanted too.
       views: of the guide vane.
     """
 
     repeats: int
     seed: int
     weights: Path | None
+    large: bool = False
     views: VaneViews = dataclasses.field(default_factory=VaneViews)
 
     @functools.cached_property
@@ -90,10 +97,18 @@ class Bench:
         """Seconds of each repeat after a first one that does not count, and what was returned."""
         result, seconds = function(), []
         for _ in range(self.repeats):
+            result = None  # what is large need not be in memory twice
             began = time.perf_counter()
             result = function()
             seconds.append(time.perf_counter() - began)
         return seconds, result
+
+    def time_sparingly(self, function: Callable[[], Any]) -> list[float]:
+        """Seconds of each repeat as `time`; what takes longer than `LONG_S` is run once only."""
+        began = time.perf_counter()
+        function()
+        first = time.perf_counter() - began
+        return [first] if first > LONG_S else self.time(function)[0]
 
     def error(self, part_from_camera: RigidTransform) -> str:
         """How far a pose is off, in words."""
@@ -103,37 +118,76 @@ class Bench:
 
 
 def summarize(figures: Sequence[Figure]) -> list[dict[str, Any]]:
-    """Rows with median, range and ratio; None where something was skipped."""
-    medians = {figure.name: np.median(figure.seconds) for figure in figures if figure.seconds}
+    """Rows with median, range and what each is compared with; None where something was skipped.
+
+    The ratio to a peer is how many times faster, that to a limit how many times as long.
+    """
+    medians = {
+        figure.name: float(np.median(figure.seconds)) for figure in figures if figure.seconds
+    }
     rows = []
     for figure in figures:
-        there = figure.name in medians and figure.against in medians
+        mine = medians.get(figure.name)
+        against = []
+        for kind, others in (("peer", figure.peers), ("limit", figure.limits)):
+            for name, goal in others.items():
+                theirs, ratio = medians.get(name), None
+                if mine is not None and theirs is not None:
+                    ratio = theirs / mine if kind == "peer" else mine / theirs
+                met = _word(ratio, goal, at_least=kind == "peer")
+                against.append(
+                    {"name": name, "kind": kind, "ratio": ratio, "goal": goal, "met": met}
+                )
         rows.append(
             {
                 "name": figure.name,
                 "seconds": study.spread(figure.seconds) if figure.seconds else None,
                 "repeats": len(figure.seconds),
-                "against": figure.against,
-                "ratio": float(medians[figure.name] / medians[figure.against]) if there else None,
                 "goal_s": figure.goal_s,
+                "met": _word(mine, figure.goal_s, at_least=False),
+                "against": against,
                 "note": figure.note,
             }
         )
     return rows
 
 
+def _word(value: float | None, goal: float | None, *, at_least: bool) -> str | None:
+    """Whether a goal was "met" or "missed"; None where there is no goal or no value."""
+    if value is None or goal is None:
+        return None
+    return "met" if (value >= goal if at_least else value <= goal) else "missed"
+
+
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows as aligned text."""
-    lines = [f"{'':<38}{'median (s)':>11}{'min - max':>16}{'goal':>7}{'ratio':>8}  against"]
+    """The rows as aligned text, at most 100 columns wide but for long notes."""
+    lines = [f"{'':<46}{'median (s)':>11}{'min - max':>20}  goal (s)"]
     for row in rows:
-        cells = f"{'-':>11}{'':>16}"
+        cells = f"{'-':>11}{'':>20}"
         if row["seconds"]:
-            span = f"{row['seconds']['min']:.3f} - {row['seconds']['max']:.3f}"
-            cells = f"{row['seconds']['median']:>11.3f}{span:>16}"
-        goal = "" if row["goal_s"] is None else f"{row['goal_s']:g}"
-        ratio = "" if row["ratio"] is None else f"{row['ratio']:.2f}"
-        against = row["against"] or ""
-        lines.append(f"{row['name']:<38}{cells}{goal:>7}{ratio:>8}  {against}".rstrip())
+            median, least, most = (shown(row["seconds"][k]) for k in ("median", "min", "max"))
+            cells = f"{median:>11}{f'{least} - {most}':>20}"
+        goal = ""
+        if row["goal_s"] is not None:
+            goal = f"  {row['goal_s']:g}" + (f": {row['met']}" if row["met"] else "")
+        lines.append(f"{row['name']:<46}{cells}{goal}".rstrip())
+        lines += [f"    {_comparison(entry)}" for entry in row["against"]]
         if row["note"]:
             lines.append(f"    {row['note']}")
     return "\n".join(lines)
+
+
+def _comparison(entry: Mapping[str, Any]) -> str:
+    """Such as "6.21 times as fast as Open3D; at least 6: met"."""
+    if entry["ratio"] is None:
+        return f"not compared with {entry['name']}"
+    fast, bound = ("fast", "at least") if entry["kind"] == "peer" else ("long", "at most")
+    words = f"{entry['ratio']:.2f} times as {fast} as {entry['name']}"
+    if entry["met"] is None:
+        return words
+    return f"{words}; {bound} {entry['goal']:g}: {entry['met']}"
+
+
+def shown(seconds: float) -> str:
+    """A time for the table: to the millisecond, short ones to a tenth of it."""
+    return f"{seconds:.3f}" if seconds >= 0.1 else f"{seconds:.4f}"

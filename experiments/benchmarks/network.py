@@ -1,0 +1,148 @@
+"""Times of RPM-Net: a step of training and a registration, beside PyTorch and beside arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments import machine
+from experiments.flops import inference_flops, step_flops
+from experiments.timing import Bench, Figure
+from experiments.vane_pairs import VanePairs
+from vanejax.pairs import Pair
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+
+TEST_ITERATIONS = 5
+
+
+def step(bench: Bench) -> Iterator[Figure]:
+    """One step of training on a batch of four pairs."""
+    pairs = VanePairs()
+    iterations = pairs.config.loss.iterations
+    flops = step_flops(
+        pairs.config.make_model(), pairs.sources, pairs.targets, iterations, pairs.batch
+    )
+    yield arithmetic(bench, "arithmetic of a step", flops)
+    yield torch_step(bench, pairs)
+    seconds, loss = bench.time(training(pairs))
+    yield Figure(
+        f"training step, batch {pairs.batch}",
+        seconds,
+        peers={"PyTorch, training step": 1.0},
+        limits={"arithmetic of a step": 3.0},
+        goal_s=1.0,
+        note=f"{sizes(pairs)}, {iterations} iterations, loss {loss:.3f}",
+    )
+
+
+def inference(bench: Bench) -> Iterator[Figure]:
+    """One registration, the reference's features given."""
+    pairs = VanePairs()
+    flops = inference_flops(
+        pairs.config.make_model(), pairs.sources, pairs.targets, TEST_ITERATIONS
+    )
+    yield arithmetic(bench, "arithmetic of an inference", flops)
+    yield torch_inference(bench, pairs)
+    seconds, _ = bench.time(registering(pairs))
+    yield Figure(
+        "inference, batch 1",
+        seconds,
+        peers={"PyTorch, inference": 1.0},
+        limits={"arithmetic of an inference": None},
+        goal_s=0.09,
+        note=f"{sizes(pairs)}, {TEST_ITERATIONS} iterations, features of the reference given",
+    )
+
+
+def arithmetic(bench: Bench, name: str, flops: int) -> Figure:
+    """The time of so many operations at the rate of a large matrix product, measured now."""
+    rates = machine.flops_per_second(bench.repeats)
+    size = machine.MATMUL_SIZE
+    note = (
+        f"{flops / 1e9:.1f} GFLOP at {np.median(rates) / 1e9:.0f} GFLOP/s, the rate of a "
+        f"{size} x {size} f32 product"
+    )
+    return Figure(name, [flops / rate for rate in rates], note=note)
+
+
+def sizes(pairs: VanePairs) -> str:
+    """In words."""
+    return f"{pairs.sources} x {pairs.targets} points, k = {pairs.neighbors}"
+
+
+def training(pairs: VanePairs) -> Callable[[], float]:
+    """Steps of one training run, each of which gives its loss."""
+    train_step, state = pairs.train_step(), pairs.state()
+
+    def one() -> float:
+        nonlocal state
+        state, metrics = train_step(state, pairs.bank)
+        return float(metrics["loss"])
+
+    return one
+
+
+def registering(pairs: VanePairs) -> Callable[[], RigidTransform]:
+    """A registration of one pair, the reference's features computed before."""
+    model, variables = pairs.config.make_model(), pairs.state().variables
+    pair = pairs.pair(0)
+    features = jax.jit(lambda variables, cloud: model.apply(variables, cloud, method="features"))(
+        variables, pair.target
+    )
+
+    @jax.jit
+    def infer(
+        variables: Any, source: PointCloud, target: PointCloud, features: jax.Array
+    ) -> RigidTransform:
+        start = RigidTransform.identity()
+        matches = model.apply(variables, source, target, start, TEST_ITERATIONS, features)
+        return matches[-1].target_from_source
+
+    return lambda: jax.block_until_ready(infer(variables, pair.source, pair.target, features))
+
+
+def torch_step(bench: Bench, pairs: VanePairs) -> Figure:
+    """The published step: each pair with its own reference, the published loss."""
+    name = "PyTorch, training step"
+    try:
+        import torch
+
+        from experiments import torch_rpmnet
+    except ImportError as error:
+        return Figure(name, [], note=f"skipped: {error}")
+
+    model = torch_rpmnet.TorchRpmNet(num_neighbors=pairs.neighbors)
+    batch = [pairs.pair(seed) for seed in range(pairs.batch)]
+    tensors = [torch.tensor(np.stack(arrays)) for arrays in zip(*map(_arrays, batch), strict=True)]
+    iterations = pairs.config.loss.iterations
+    one = torch_rpmnet.make_train_step(model, iterations=iterations)
+    seconds, loss = bench.time(lambda: one(*tensors))
+    note = f"a reference for each pair, {torch.get_num_threads()} threads, loss {loss:.3f}"
+    return Figure(name, seconds, note=note)
+
+
+def torch_inference(bench: Bench, pairs: VanePairs) -> Figure:
+    """The published registration: features of both clouds in each iteration."""
+    name = "PyTorch, inference"
+    try:
+        import torch
+
+        from experiments import torch_rpmnet
+    except ImportError as error:
+        return Figure(name, [], note=f"skipped: {error}")
+
+    model = torch_rpmnet.TorchRpmNet(num_neighbors=pairs.neighbors)
+    source, target, _ = (torch.tensor(array[None]) for array in _arrays(pairs.pair(0)))
+    with torch.no_grad():
+        seconds, _ = bench.time(lambda: model(source, target, TEST_ITERATIONS))
+    return Figure(name, seconds, note=f"{torch.get_num_threads()} threads")
+
+
+def _arrays(pair: Pair) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Source [N, 6], target [M, 6] and target_from_source [3, 4], as PyTorch's code takes them."""
+    clouds = (np.concatenate([c.xyz, c.normals], -1) for c in (pair.source, pair.target))
+    return *clouds, np.asarray(pair.target_from_source.as_matrix())[:3]

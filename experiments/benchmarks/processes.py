@@ -1,0 +1,89 @@
+"""Times of whole processes: how the command starts, and how it registers."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from experiments.run_folder import write_json
+from experiments.timing import Bench, Figure
+from vanejax.errors import InputError
+from vanejax.pose_file import pose_to_dict
+from vanejax.scan_file import save_points
+
+
+def start(bench: Bench) -> Iterator[Figure]:
+    """How long it takes until anything can happen."""
+    for name, arguments, goal_s in (
+        ("python -c pass", ["-c", "pass"], None),
+        ("python -c 'import vanejax'", ["-c", "import vanejax"], 0.5),
+        ("vanejax --help", ["-m", "vanejax", "--help"], 1.0),
+    ):
+        run(arguments)  # reads the files into memory
+        seconds = [run(arguments) for _ in range(bench.repeats)]
+        limits = {} if goal_s is None else {"python -c pass": None}
+        yield Figure(name, seconds, limits=limits, goal_s=goal_s)
+
+
+def command(bench: Bench) -> Iterator[Figure]:
+    """`vanejax register` as a process: with an empty compilation cache, then with a full one.
+
+    Against a process that imports JAX and leaves.
+    """
+    seconds = [run(["-c", "import jax"]) for _ in range(bench.repeats)]
+    yield Figure("python -c 'import jax'", seconds)
+    with tempfile.TemporaryDirectory() as folder:
+        scan, guess = Path(folder) / "scan.ply", Path(folder) / "guess.json"
+        save_points(scan, bench.points)
+        write_json(guess, pose_to_dict(bench.rough))
+        arguments = ["-m", "vanejax", "register", str(scan), "vane", "--quiet"]
+        if bench.weights is not None:
+            arguments += ["--weights", str(bench.weights.absolute())]
+        for words, more in (("rough pose", ["--init", str(guess)]), ("any pose", [])):
+            first, second = [], []
+            for repeat in range(bench.repeats):
+                cache = str(Path(folder) / f"cache {words} {repeat}")
+                for seconds in (first, second):
+                    seconds.append(run([*arguments, *more], VANEJAX_CACHE_DIR=cache))
+            with_weights = "" if bench.weights is None else "weights, "
+            for turn, seconds, goal_s in (("first", first, 8.0), ("second", second, 5.0)):
+                yield Figure(
+                    f"command, {with_weights}{words}, {turn} run",
+                    seconds,
+                    limits={"python -c 'import jax'": None},
+                    goal_s=goal_s if words == "rough pose" else None,
+                )
+
+
+def run(arguments: Sequence[str], **environment: str) -> float:
+    """Seconds of a Python process.
+
+    Raises:
+      InputError: it ended with neither success nor a verdict.
+    """
+    began = time.perf_counter()
+    output(arguments, **environment)
+    return time.perf_counter() - began
+
+
+def output(arguments: Sequence[str], **environment: str) -> str:
+    """What a Python process prints.
+
+    Raises:
+      InputError: it ended with neither success nor a verdict.
+    """
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode not in (0, 3, 4):
+        raise InputError(f"python {' '.join(arguments)} failed: {done.stderr.strip()}")
+    return done.stdout

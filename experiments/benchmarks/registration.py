@@ -1,0 +1,108 @@
+"""Times of the fine registration, and of `register` around it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from experiments.other_icp import OPEN3D_ICP, SMALL_GICP, open3d_icp, small_gicp_icp
+from experiments.timing import Bench, Figure
+from vanejax.locate import register
+from vanejax.part import Part
+from vanejax.refine import refine
+from vanejax.residuals import Precision, RayCasting, Residuals
+from vanejax.rigid import RigidTransform
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CountedRays(RayCasting):
+    """A model that remembers how many rays it was asked to cast.
+
+    Attributes:
+      rays: of each call so far.
+    """
+
+    rays: list[int] = dataclasses.field(default_factory=list)
+
+    def residuals(
+        self, part_from_camera: RigidTransform, points: np.ndarray, *, feet: Precision = "faces"
+    ) -> Residuals:
+        """See `RayCasting`."""
+        self.rays.append(len(part_from_camera.rotation) * len(points))
+        return super().residuals(part_from_camera, points, feet=feet)
+
+
+def bare_scene(part: Part) -> EmbreeScene:
+    """Embree's scene of a part about its centre."""
+    scene = EmbreeScene(robust=True)
+    vertices = (part.mesh.vertices - part.center[None]).astype(np.float32)
+    TriangleMesh(scene, vertices, np.ascontiguousarray(part.mesh.faces, np.int32))
+    return scene
+
+
+def bare_rays(
+    part: Part, pose: RigidTransform, points: np.ndarray
+) -> tuple[EmbreeScene, np.ndarray, np.ndarray]:
+    """What Embree alone takes: a scene about the part's centre, origins and directions [N, 3] f32.
+
+    The rays are those of the points of a scan, from just before the part.
+    """
+    eye = pose.translation - part.center
+    directions = pose.rotate(points / np.linalg.norm(points, axis=1, keepdims=True))
+    origins = eye + (np.linalg.norm(eye) - 1.1 * part.radius) * directions
+    return bare_scene(part), origins.astype(np.float32), directions.astype(np.float32)
+
+
+def refine_against_casts(bench: Bench) -> Iterator[Figure]:
+    """`refine`, beside the time that Embree alone needs for as many rays of the same scan."""
+    model, points, start = bench.views.model, bench.points, bench.rough
+    counted = CountedRays(model.scanner, model.surface, model.sensor_origin)
+    refine(counted, points, start)
+    rays = sum(counted.rays)
+    scene, origins, directions = bare_rays(model.part, start, points)
+
+    def cast() -> None:
+        for left in range(rays, 0, -len(origins)):
+            scene.run(origins[:left], directions[:left])
+
+    seconds, _ = bench.time(cast)
+    note = f"{rays / 1e6:.2f} M rays, {rays / np.median(seconds) / 1e6:.1f} M/s in one thread"
+    yield Figure("bare casts of refine", seconds, note=note)
+    yield open3d_icp(bench)
+    yield small_gicp_icp(bench)
+    seconds, found = bench.time(lambda: refine(model, points, start))
+    yield Figure(
+        "refine",
+        seconds,
+        peers={OPEN3D_ICP: 1.0, SMALL_GICP: 1.0},
+        limits={"bare casts of refine": None},
+        goal_s=0.5,
+        note=f"{len(points):,} points, {bench.error(found.part_from_camera)}",
+    )
+
+
+def register_from(bench: Bench) -> Iterator[Figure]:
+    """`register` with and without weights and a rough pose, against `refine`."""
+    part, scan = bench.views.part, bench.scan
+    seconds, _ = bench.time(lambda: refine(bench.views.model, bench.points, bench.rough))
+    yield Figure("refine alone", seconds)
+    for name, matcher, init, goal_s in (
+        ("register, weights, rough pose", bench.matcher, bench.rough, 1.0),
+        ("register, weights, any pose", bench.matcher, None, 10.0),
+        ("register, rough pose", None, bench.rough, None),
+        ("register, any pose", None, None, None),
+    ):
+        if "weights" in name and matcher is None:
+            yield Figure(name, [], goal_s=goal_s, note="skipped: no --weights")
+            continue
+        seconds, result = bench.time(
+            functools.partial(register, scan, part, weights=matcher, init=init)
+        )
+        stages = ", ".join(f"{stage} {spent:.2f}" for stage, spent in result.seconds.items())
+        note = f"{result.verdict.status}, {bench.error(result.part_from_camera)}; {stages}"
+        yield Figure(name, seconds, limits={"refine alone": None}, goal_s=goal_s, note=note)
