@@ -35,8 +35,8 @@ def read_triangles(path: Path, *, units: str) -> tuple[np.ndarray, np.ndarray, t
       units: unit of the numbers in the file, a key of `MM_PER_UNIT`.
 
     Returns:
-      vertices [V, 3] f64 in mm, not necessarily finite; faces [F, 3] i64, not necessarily closed;
-      a sentence per oddity that was passed over.
+      vertices [V, 3] f64 in mm, not necessarily finite; faces [F, 3] i32 or i64, not necessarily
+      closed; a sentence per oddity that was passed over.
 
     Raises:
       InputError: the file is missing, empty, truncated, too large or of another kind.
@@ -68,7 +68,8 @@ def read_triangles(path: Path, *, units: str) -> tuple[np.ndarray, np.ndarray, t
     scale = MM_PER_UNIT[units]
     if suffix == ".stl":
         vertices, notes = _read_stl(data, path)
-        return vertices * scale, np.arange(len(vertices)).reshape(-1, 3), notes
+        vertices *= scale
+        return vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), notes
     if suffix in (".step", ".stp"):
         data, suffix, scale = _glb_of_step(data, path, units), ".glb", 1000.0  # always metres
     vertices, faces = _read_scene(data, path, suffix)
@@ -95,9 +96,10 @@ def _read_stl(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     if not stated:
         raise InputError(f"{path}: an STL file without triangles; export it again")
     extra = held - stated * _FACET.itemsize
-    facets = np.frombuffer(data, _FACET, count=stated, offset=84)
+    corners = np.empty((stated, 3, 3))
+    corners[:] = np.frombuffer(data, _FACET, count=stated, offset=84)["corners"]
     notes = (f"passed over {extra} bytes after the last triangle",) if extra else ()
-    return facets["corners"].reshape(-1, 3).astype(np.float64), notes
+    return corners.reshape(-1, 3), notes
 
 
 def _read_ascii_stl(data: bytes, path: Path) -> np.ndarray:

@@ -159,7 +159,7 @@ def make_scan_set(
         normals[view, : len(xyz)] = normal
 
     # about 16 samples for each voxel that the surface crosses: hardly one is missed
-    drawn = int(np.clip(16 * part.mesh.area / voxel_mm**2, 1_000, 4_000_000))
+    drawn = int(np.clip(16 * part.triangles.areas().sum() / voxel_mm**2, 1_000, 4_000_000))
     surface, outward, _ = part.sample(drawn, seed=0)
     kept = voxel_thin(surface, voxel_mm=voxel_mm)
     if len(kept) < 64:

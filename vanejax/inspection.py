@@ -29,7 +29,7 @@ from vanejax.point_records import PointFile
 from vanejax.scan_file import robust_extent
 from vanejax.sensor_place import sampled_rows, why_not_from
 from vanejax.solid_bodies import connected
-from vanejax.triangles import Edges, Triangles, weld
+from vanejax.triangles import Triangles, in_use, weld
 
 # diagonals of parts and scans that a structured-light scanner is used for
 _SMALLEST_MM, _LARGEST_MM = 5.0, 3000.0
@@ -217,25 +217,28 @@ def _normals_in_words(points: np.ndarray, normals: np.ndarray | None, origin: np
 def _inspect_mesh(path: Path, written: str) -> Inspection:
     vertices, faces, notes, stated = _triangles(path)
     finite = np.isfinite(vertices).all(axis=1)
-    used = finite if finite.all() else np.flatnonzero(finite)
-    units, reason = _likely_unit(float(np.linalg.norm(_extent(vertices[used]) or 0.0)))
+    extent = _extent(vertices if finite.all() else vertices[finite])
+    units, reason = _likely_unit(float(np.linalg.norm(extent or 0.0)))
     if stated:
         units, reason = stated, "by the file's own word or standard"
     scale = MM_PER_UNIT[units or "mm"]
-    watertight = bodies = volume = None
+    mesh = watertight = bodies = volume = None
     inside = len(faces) > 0 and faces.min() >= 0 and faces.max() < len(vertices)
     if inside and finite.all():
         mesh = weld(Triangles(vertices, faces))
-        watertight = not np.any(Edges.of(mesh.faces).net)
+        watertight = not np.any(mesh.edges.net)
         pairs = np.concatenate([mesh.faces[:, :2], mesh.faces[:, 1:]])
-        _, label = connected(pairs, len(mesh.points))
-        bodies = len(np.unique(label[mesh.faces[:, 0]]))
+        count, label = connected(pairs, len(mesh.points))
+        bodies = int(np.count_nonzero(in_use(label[mesh.faces[:, 0]], count)))
     name = shlex.quote(str(path))
     option = _option("cad", units)
     try:
-        part = part_from_mesh(vertices * scale, faces, name=path.name)
+        if scale == 1 and mesh is not None:  # its corners need not be welded twice
+            part = part_from_mesh(mesh.points, mesh.faces, name=path.name)
+        else:
+            part = part_from_mesh(vertices * scale, faces, name=path.name)
         notes = (*notes, *part.notes)
-        volume = float(part.mesh.volume)
+        volume = part.triangles.volume()
         steps = (
             f"vanejax register SCAN.ply {name}{option}",
             f"vanejax scan {name}{option} --out scans",
@@ -253,7 +256,7 @@ def _inspect_mesh(path: Path, written: str) -> Inspection:
         size_bytes=path.stat().st_size,
         points=len(vertices),
         faces=len(faces),
-        extent=_extent(vertices[used]),
+        extent=extent,
         units=units,
         units_reason=reason,
         watertight=watertight,

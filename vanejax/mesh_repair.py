@@ -10,16 +10,17 @@ import scipy.spatial
 from vanejax.errors import InputError
 from vanejax.solid_bodies import connected, outward_bodies, united, wind_consistently
 from vanejax.triangles import (
-    Edges,
     Triangles,
     areas,
     counted,
     drop_collapsed,
     drop_doubled,
+    in_use,
+    renumbered,
     weld,
 )
 
-MAX_FACES = 2_000_000  # an Embree scene, edge tables and samples of this stay below 1.5 GB
+MAX_FACES = 20_000_000  # the part and its Embree scene: 7 GB
 MAX_OPEN_EDGES = 20_000  # more is no crack but a surface that was never closed
 SMALL_HOLE = 0.05  # of the part's diagonal: what is filled without asking
 SLIT_AREA = 1e-9  # of the diagonal squared: a crack along which nothing is missing
@@ -56,7 +57,7 @@ def repair_solid(
         )
     mesh = _weld_open_edges(mesh, notes)
     mesh, body = wind_consistently(mesh, name, notes)
-    if np.any(Edges.of(mesh.faces).net):
+    if np.any(mesh.edges.net):
         filled = drop_collapsed(weld(_fill_holes(mesh, name, notes)), [])
         mesh, body = wind_consistently(filled, name, notes)  # slits may have parted a body
     bodies = outward_bodies(mesh, body, name, notes)
@@ -102,16 +103,19 @@ def _checked(vertices: np.ndarray, faces: np.ndarray, name: str) -> Triangles:
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{name}: a face points at a vertex outside 0..{len(vertices) - 1}")
-    used, index = np.unique(faces, return_inverse=True)
-    vertices, faces = vertices[used], index.reshape(faces.shape)
-    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-    if len(bad):
+    used = in_use(faces, len(vertices))
+    faces = renumbered(faces, used)
+    if not used.all():
+        vertices = vertices[used]
+    low, high = float(vertices.min()), float(vertices.max())  # NaN if there is one
+    if not np.isfinite([low, high]).all():
+        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
         raise InputError(
             f"{name}: {len(bad)} of {len(vertices)} vertices are not finite (the first: "
-            f"{vertices[bad[0]]}, vertex {used[bad[0]]}); "
+            f"{vertices[bad[0]]}, vertex {np.flatnonzero(used)[bad[0]]}); "
             "export the part again as one solid body"
         )
-    far = float(np.abs(vertices).max())
+    far = max(-low, high)
     # half a unit in the last of float32's 24 digits
     if far * 2.0**-24 > MAX_ROUNDING_MM:
         raise InputError(
@@ -123,18 +127,17 @@ def _checked(vertices: np.ndarray, faces: np.ndarray, name: str) -> Triangles:
 
 def _weld_open_edges(mesh: Triangles, notes: list[str]) -> Triangles:
     """Closes cracks: vertices of open edges that are next to each other become one."""
-    edges = Edges.of(mesh.faces)
-    odd = edges.uses % 2 == 1
+    odd = mesh.edges.uses % 2 == 1
     if not odd.any():
         return mesh
     # a stray face without area can hang on a closed surface: gone, if that leaves fewer open edges
-    solid = areas(mesh.corners()) > 0
+    solid = mesh.areas() > 0
     if solid.any() and not solid.all():
-        rest = Edges.of(mesh.faces[solid])
-        if np.sum(rest.uses % 2) < np.sum(odd):
+        rest = Triangles(mesh.points, mesh.faces[solid])
+        if np.sum(rest.edges.uses % 2) < np.sum(odd):
             notes.append(f"dropped {counted(int(np.sum(~solid)), 'face')} without area")
-            mesh, edges, odd = Triangles(mesh.points, mesh.faces[solid]), rest, rest.uses % 2 == 1
-    rim = np.unique(edges.ends[odd[edges.group]])
+            mesh, odd = rest, rest.edges.uses % 2 == 1
+    rim = np.unique(mesh.edges.ends[mesh.edges.rows(odd)])
     if not len(rim):
         return mesh
     reach = WELD * mesh.diagonal()
@@ -154,15 +157,15 @@ def _weld_open_edges(mesh: Triangles, notes: list[str]) -> Triangles:
 
 def _fill_holes(mesh: Triangles, name: str, notes: list[str]) -> Triangles:
     """Fills holes of three edges, slits without area, and what is small beside the part."""
-    edges = Edges.of(mesh.faces)
-    open_edge = (edges.net != 0)[edges.group]
+    edges = mesh.edges
     tangled = int(np.sum(edges.uses[edges.net != 0] > 2))
     if tangled:
         raise InputError(
             f"{name}: not a solid: at {counted(tangled, 'edge')} three or more surfaces meet; "
             "export the part again as one solid body, without inner walls"
         )
-    rim = edges.ends[open_edge][:, ::-1]  # the direction in which the missing faces run
+    # the direction in which the missing faces run
+    rim = edges.ends[edges.rows(edges.net != 0)][:, ::-1]
     if len(rim) > MAX_OPEN_EDGES:
         raise InputError(
             f"{name}: not a closed solid: {len(rim):,} open edges; "

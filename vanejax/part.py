@@ -15,6 +15,7 @@ from vanejax.cad_file import MM_PER_UNIT, read_triangles
 from vanejax.camera import Camera
 from vanejax.errors import InputError
 from vanejax.mesh_repair import open_surface, repair_solid
+from vanejax.triangles import Triangles
 
 # in the order in which a wrong unit is likely: "ft" comes last, few write CAD in it
 _UNIT_NAMES = {
@@ -48,6 +49,11 @@ class Part:
     name: str
     notes: tuple[str, ...] = ()
     closed: bool = True
+
+    @functools.cached_property
+    def triangles(self) -> Triangles:
+        """The mesh as two arrays, not copied; to go through its faces block by block."""
+        return Triangles(np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces))
 
     @functools.cached_property
     def center(self) -> np.ndarray:
@@ -84,18 +90,17 @@ class Part:
         if count < 1:
             raise InputError(f"cannot draw {count} points; ask for at least 1")
         rng = np.random.default_rng(seed)
-        corners = np.asarray(self.mesh.vertices)[self.mesh.faces]
-        a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        cross = np.cross(ab, ac)
-        double_area = np.linalg.norm(cross, axis=1)
-        total = np.cumsum(double_area)
+        total = np.cumsum(self.triangles.areas())
         # side="right" never lands on a face without area
         face = np.searchsorted(total, rng.random(count) * total[-1], side="right")
+        corners = self.triangles.points[self.triangles.faces[face]]
+        a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        cross = np.cross(ab, ac)
         u, v = rng.random((2, count, 1))
         outside = u + v > 1  # the other half of the parallelogram: fold it back
         u, v = np.where(outside, 1 - u, u), np.where(outside, 1 - v, v)
-        points = a[face] + u * ab[face] + v * ac[face]
-        return points, cross[face] / double_area[face, None], face.astype(np.int32)
+        normals = cross / np.linalg.norm(cross, axis=1, keepdims=True)
+        return a + u * ab + v * ac, normals, face.astype(np.int32)
 
     def export(self, path: str | os.PathLike[str]) -> None:
         """Writes .stl, .ply or .obj in mm, or .glb in metres (as its standard says).
@@ -154,7 +159,9 @@ def load_part(
     """
     path = Path(path)
     vertices, faces, notes = read_triangles(path, units=units)
-    finite = vertices[np.isfinite(vertices).all(axis=1)]
+    finite = vertices
+    if not np.isfinite(vertices).all():
+        finite = vertices[np.isfinite(vertices).all(axis=1)]
     if len(finite):
         notes += _check_size(float(np.ptp(finite, axis=0).max()), units, camera or Camera(), path)
     part = part_from_mesh(vertices, faces, name=path.name, must_be_closed=must_be_closed)

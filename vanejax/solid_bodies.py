@@ -14,7 +14,8 @@ from vanejax.triangles import (
     counted,
     drop_collapsed,
     drop_doubled,
-    signed_volume,
+    in_use,
+    renumbered,
     weld,
 )
 
@@ -35,12 +36,13 @@ def wind_consistently(mesh: Triangles, name: str, notes: list[str]) -> tuple[Tri
     neighbours are linked where they agree. A body falls into two components, one per orientation;
     if into one only, it is a Moebius strip.
     """
-    edges, count = Edges.of(mesh.faces), len(mesh.faces)
-    order = np.argsort(edges.group, kind="stable")
-    paired = order[(edges.uses == 2)[edges.group[order]]].reshape(-1, 2)
-    paired = np.concatenate([paired, *_wedges(mesh, edges, order)])
+    edges, count = mesh.edges, len(mesh.faces)
+    paired = edges.order[np.repeat(edges.uses == 2, edges.uses)].reshape(-1, 2)
+    paired = np.concatenate([paired, *_wedges(mesh, edges)])
     one, two = (paired // 3).T
     turned = edges.ends[paired[:, 0], 0] == edges.ends[paired[:, 1], 0]
+    if not turned.any():  # then the two halves of the cover are alike and apart
+        return mesh, connected(np.stack([one, two], axis=1), count)[1]
     other = two + np.where(turned, count, 0)
     cover = np.stack([np.r_[one, one + count], np.r_[other, (other + count) % (2 * count)]], 1)
     _, label = connected(cover, 2 * count)
@@ -50,7 +52,8 @@ def wind_consistently(mesh: Triangles, name: str, notes: list[str]) -> tuple[Tri
             f"{name}: the surface has one side only (a Moebius strip); "
             "export the part again as one solid body"
         )
-    _, body = np.unique(np.minimum(as_is, flipped), return_inverse=True)
+    body = np.minimum(as_is, flipped)
+    body = renumbered(body, in_use(body, 2 * count))
     flip = as_is > flipped
     flip ^= (np.bincount(body, flip) > 0.5 * np.bincount(body))[body]
     if not flip.any():
@@ -59,17 +62,19 @@ def wind_consistently(mesh: Triangles, name: str, notes: list[str]) -> tuple[Tri
     return Triangles(mesh.points, np.where(flip[:, None], mesh.faces[:, ::-1], mesh.faces)), body
 
 
-def _contains(corners: np.ndarray, point: np.ndarray) -> bool:
-    """Whether closed triangles [F, 3, 3] wind around a point [3] (van Oosterom, Strackee 1983)."""
-    a, b, c = np.moveaxis(corners - point, 1, 0)
-    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    dot = lambda u, v: np.sum(u * v, axis=1)  # noqa: E731
-    below = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
-    turns = np.sum(np.arctan2(dot(a, np.cross(b, c)), below)) / (2 * np.pi)
+def _contains(body: Triangles, point: np.ndarray) -> bool:
+    """Whether a closed body winds around a point [3] (van Oosterom, Strackee 1983)."""
+    turns = 0.0
+    for corners in body.blocks():
+        a, b, c = np.moveaxis(corners - point, 1, 0)
+        la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+        dot = lambda u, v: np.sum(u * v, axis=1)  # noqa: E731
+        below = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
+        turns += np.sum(np.arctan2(dot(a, np.cross(b, c)), below)) / (2 * np.pi)
     return abs(turns) > 0.75  # 0.5 is on the surface
 
 
-def _wedges(mesh: Triangles, edges: Edges, order: np.ndarray) -> list[np.ndarray]:
+def _wedges(mesh: Triangles, edges: Edges) -> list[np.ndarray]:
     """Pairs [P, 2] of edge rows that bound the same solid, where bodies touch along an edge.
 
     Seen along such an edge the solids are wedges. With the file's winding, going around in the
@@ -80,7 +85,7 @@ def _wedges(mesh: Triangles, edges: Edges, order: np.ndarray) -> list[np.ndarray
     first = np.concatenate([[0], np.cumsum(edges.uses)])
     pairs = []
     for group in np.flatnonzero((edges.uses > 2) & (edges.net == 0)):
-        rows = order[first[group] : first[group + 1]]
+        rows = edges.order[first[group] : first[group + 1]]
         low, high = mesh.points[np.sort(edges.ends[rows[0]])]
         axis = (high - low) / np.linalg.norm(high - low)
         spoke = mesh.points[mesh.faces[rows // 3, (rows + 2) % 3]] - low
@@ -110,16 +115,18 @@ def outward_bodies(
             f"{name}: {count:,} separate bodies, more than {MAX_BODIES}: this is an assembly or "
             "not welded; export the one part that the camera sees"
         )
-    pieces = [mesh.faces[body == index] for index in range(count)]
+    pieces = [mesh]
     if count > 1:
+        by_body = np.argsort(body.astype(np.uint16), kind="stable")  # small ones are not compared
+        parted = np.split(mesh.faces[by_body], np.cumsum(np.bincount(body))[:-1])
+        pieces = [Triangles(mesh.points, faces) for faces in parted]
         # patches that close only together are one body
-        partial = [bool(np.any(Edges.of(faces).net)) for faces in pieces]
-        closed = [faces for faces, open_ in zip(pieces, partial, strict=True) if not open_]
-        rest = [faces for faces, open_ in zip(pieces, partial, strict=True) if open_]
-        pieces = closed + ([np.concatenate(rest)] if rest else [])
-    corners = [mesh.points[faces] for faces in pieces]
-    volume = np.array([signed_volume(c) for c in corners])
-    size = np.array([np.linalg.norm(np.ptp(c.reshape(-1, 3), axis=0)) for c in corners])
+        rest = [piece.faces for piece in pieces if np.any(piece.edges.net)]
+        pieces = [piece for piece in pieces if not np.any(piece.edges.net)]
+        pieces += [Triangles(mesh.points, np.concatenate(rest))] if rest else []
+    volume = np.array([piece.volume() for piece in pieces])
+    low, high = np.moveaxis(np.stack([piece.bounds() for piece in pieces]), 1, 0)
+    size = np.linalg.norm(high - low, axis=1)
     solid = np.abs(volume) > 1e-12 * size**3  # rounding leaves 1e-16, a long wire 1e-10
     if not solid.any():
         raise InputError(
@@ -128,8 +135,6 @@ def outward_bodies(
     if not solid.all():
         notes.append(f"dropped {counted(int(np.sum(~solid)), 'flat body')}")
     index = np.flatnonzero(solid)
-    low = np.array([c.min(axis=(0, 1)) for c in corners])
-    high = np.array([c.max(axis=(0, 1)) for c in corners])
     outermost = {}
     for i in index:
         around = [
@@ -138,7 +143,7 @@ def outward_bodies(
             if j != i
             and np.all(low[j] <= low[i])
             and np.all(high[i] <= high[j])
-            and _contains(corners[j], corners[i][0, 0])
+            and _contains(pieces[j], mesh.points[pieces[i].faces[0, 0]])
         ]
         outermost[i] = max(around, key=lambda j: abs(volume[j]), default=None)
     # an inside-out body turns with all that is inside it: its cavities stay cavities
@@ -152,7 +157,7 @@ def outward_bodies(
     if cavities:
         notes.append(f"dropped {counted(cavities, 'closed cavity')} that no camera can see")
     return [
-        Triangles(mesh.points, pieces[i][:, ::-1] if i in turned else pieces[i])
+        Triangles(mesh.points, pieces[i].faces[:, ::-1]) if i in turned else pieces[i]
         for i in index
         if outward[i] > 0
     ]
@@ -160,7 +165,8 @@ def outward_bodies(
 
 def united(bodies: list[Triangles], name: str, notes: list[str]) -> Triangles:
     """One mesh of all bodies; overlapping bodies are united so that no inner wall is left."""
-    apart = canonical(Triangles(bodies[0].points, np.concatenate([body.faces for body in bodies])))
+    faces = np.concatenate([body.faces for body in bodies]) if len(bodies) > 1 else bodies[0].faces
+    apart = canonical(Triangles(bodies[0].points, faces))
     if len(bodies) == 1:
         return apart
     solids = []

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from trimesh.triangles import closest_point
 
 from vanejax.part import Part
+from vanejax.triangles import areas
 
 SAMPLES = 40_000  # mean spacing on a part of radius 70 mm: about 1 mm
 CELLS = 48  # of the lookup grid, along the longest side
@@ -58,14 +59,18 @@ class Surface:
         Exact integrals: over a triangle of area A with corners v and centroid m, that of x x^T is
         ``A / 12 (sum v v^T + 9 m m^T)``.
         """
-        corners = np.asarray(self.part.mesh.triangles, np.float64)
-        area = np.asarray(self.part.mesh.area_faces, np.float64)
-        centroid = corners.mean(axis=1)
-        middle = area @ centroid / area.sum()
-        corners, centroid = corners - middle, centroid - middle
-        second = np.einsum("f,fki,fkj->ij", area, corners, corners)
-        second += 9 * np.einsum("f,fi,fj->ij", area, centroid, centroid)
-        return middle, np.linalg.eigh(second)[1].T
+        total, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
+        for corners in self.part.triangles.blocks():
+            corners -= self.part.center
+            area, centroid = areas(corners), corners.mean(axis=1)
+            total += area.sum()
+            first += area @ centroid
+            flat = corners.reshape(-1, 3)
+            second += (np.repeat(area, 3)[:, None] * flat).T @ flat
+            second += 9 * (area[:, None] * centroid).T @ centroid
+        middle = first / total
+        second -= 12 * total * np.outer(middle, middle)  # about the middle, not the centre
+        return middle + self.part.center, np.linalg.eigh(second)[1].T
 
     @functools.cached_property
     def _grid(self) -> tuple[np.ndarray, float, np.ndarray]:

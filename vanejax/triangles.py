@@ -8,13 +8,18 @@ collapsed faces, so neither can open a mesh that was closed.
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Iterator
 
 import numpy as np
+
+BLOCK = 1 << 15  # faces at a time: their arrays stay in the cache
+_HASH_FACTOR = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: odd, so nothing is lost
 
 
 @dataclasses.dataclass(frozen=True)
 class Triangles:
-    """An indexed triangle mesh: points [V, 3] f64 (float32 values), faces [F, 3] i64."""
+    """An indexed triangle mesh: points [V, 3] f64 (float32 values), faces [F, 3] i32 or i64."""
 
     points: np.ndarray
     faces: np.ndarray
@@ -22,6 +27,30 @@ class Triangles:
     def corners(self) -> np.ndarray:
         """[F, 3, 3]: face, corner, coordinate."""
         return self.points[self.faces]
+
+    def blocks(self) -> Iterator[np.ndarray]:
+        """`corners` of some faces at a time: of all they would be larger than the mesh itself."""
+        for start in range(0, len(self.faces), BLOCK):
+            yield self.points[self.faces[start : start + BLOCK]]
+
+    @functools.cached_property
+    def edges(self) -> Edges:
+        """The edges of the faces; they are sorted once, by whoever asks first."""
+        return Edges.of(self.faces)
+
+    def bounds(self) -> np.ndarray:
+        """[2, 3]: lower and upper corner of the box around the faces."""
+        points = self.points[in_use(self.faces, len(self.points))]
+        return np.stack([points.min(axis=0), points.max(axis=0)])
+
+    def areas(self) -> np.ndarray:
+        """[F]."""
+        return np.concatenate([areas(corners) for corners in self.blocks()])
+
+    def volume(self) -> float:
+        """What the faces enclose, negative where they face inward."""
+        about = self.bounds().mean(axis=0)
+        return sum(signed_volume(corners, about=about) for corners in self.blocks())
 
     def diagonal(self) -> float:
         """Length of the bounding box's diagonal."""
@@ -31,21 +60,70 @@ class Triangles:
 def weld(mesh: Triangles) -> Triangles:
     """Rounds to float32, merges equal vertices and sorts them; faces keep their order."""
     points = np.asarray(mesh.points, np.float32) + np.float32(0)  # -0 becomes 0
-    order = np.lexsort(points.T[::-1])
-    ranked = points[order]
-    first = np.concatenate([[True], np.any(ranked[1:] != ranked[:-1], axis=1)])
-    index = np.empty(len(points), np.int64)
-    index[order] = np.cumsum(first) - 1
-    return Triangles(ranked[first].astype(np.float64), index[mesh.faces])
+    order, first = _sorted_rows(points)
+    index = np.empty(len(points), np.int32)
+    index[order] = np.cumsum(first, dtype=np.int32) - np.int32(1)
+    return Triangles(points[order[first]].astype(np.float64), index[mesh.faces])
+
+
+def in_use(index: np.ndarray, count: int) -> np.ndarray:
+    """[count] bool: which rows an index, of any shape, names."""
+    used = np.zeros(count, bool)
+    used[index] = True
+    return used
+
+
+def renumbered(index: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """An index into all rows becomes one, i32, into those `in_use`."""
+    if used.all():
+        return index.astype(np.int32, copy=False)
+    return (np.cumsum(used, dtype=np.int32) - np.int32(1))[index]
 
 
 def canonical(mesh: Triangles) -> Triangles:
     """The same solid with unused vertices gone, and vertices and faces in a fixed order."""
-    used, index = np.unique(mesh.faces, return_inverse=True)
-    mesh = weld(Triangles(mesh.points[used], index.reshape(-1, 3)))
-    first = np.argmin(mesh.faces, axis=1)[:, None]
-    faces = np.take_along_axis(mesh.faces, (first + np.arange(3)) % 3, axis=1)
-    return Triangles(mesh.points, faces[np.lexsort(faces.T[::-1])])
+    used = in_use(mesh.faces, len(mesh.points))
+    mesh = weld(Triangles(mesh.points[used], renumbered(mesh.faces, used)))
+    faces, first = mesh.faces.copy(), np.argmin(mesh.faces, axis=1)
+    for corner in (1, 2):
+        turned = first == corner
+        faces[turned] = np.roll(faces[turned], -corner, axis=1)
+    return Triangles(mesh.points, faces[_sorted_rows(faces)[0]])
+
+
+def _sorted_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The order [N] that sorts rows [N, 3], f32 or i32, and which sorted ones [N] bool are new.
+
+    Two columns are one 64-bit key. Sorting that, and then what is equal in it, is four times
+    faster than `np.lexsort`.
+    """
+    order = np.argsort(_pair(_ordinal(rows[:, 0]), _ordinal(rows[:, 1])), kind="stable")
+    # not kept from above: ten million faces have 240 MB of keys
+    key = _pair(_ordinal(rows[order, 0]), _ordinal(rows[order, 1]))
+    group = np.cumsum(_new(key), dtype=np.uint32)
+    key = _pair(group, _ordinal(rows[order, 2]))
+    if np.any(key[1:] < key[:-1]):
+        again = np.argsort(key, kind="stable")
+        order, key = order[again], key[again]
+    return order, _new(key)
+
+
+def _ordinal(column: np.ndarray) -> np.ndarray:
+    """[N] u32 in the same order as a column of f32 (neither NaN nor -0) or i32."""
+    bits = np.ascontiguousarray(column).view(np.uint32)
+    if column.dtype.kind == "i":
+        return bits ^ np.uint32(1 << 31)
+    return bits ^ np.where(bits >> 31, np.uint32(0xFFFFFFFF), np.uint32(1 << 31))
+
+
+def _pair(high: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """[N] u64: in the order of ``high``, then ``low``."""
+    return high.astype(np.uint64) << np.uint64(32) | low
+
+
+def _new(ranked: np.ndarray) -> np.ndarray:
+    """[N] bool: which entries of a sorted array differ from the one before."""
+    return np.concatenate([[True], ranked[1:] != ranked[:-1]])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,14 +131,14 @@ class Edges:
     """The three directed edges of every face, row 3 f + i from corner i to corner i + 1.
 
     Attributes:
-      ends: [3F, 2] i64.
-      group: [3F] i64, equal for edges with the same two ends.
-      uses: [E] i64, edges in each group.
-      net: [E] i64, uses in ascending direction minus uses in descending direction.
+      ends: [3F, 2] i32 or i64.
+      order: [3F] i64: the rows, those with the same two ends together.
+      uses: [E] i64: how many rows there are of each edge, in that order.
+      net: [E] i64: uses in ascending direction minus uses in descending direction.
     """
 
     ends: np.ndarray
-    group: np.ndarray
+    order: np.ndarray
     uses: np.ndarray
     net: np.ndarray
 
@@ -68,10 +146,21 @@ class Edges:
     def of(cls, faces: np.ndarray) -> Edges:
         """The edges of faces [F, 3]."""
         ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        low, high = ends.min(axis=1), ends.max(axis=1)
-        _, group = np.unique(low * (faces.max() + 1) + high, return_inverse=True)
-        net = np.bincount(group, np.where(ends[:, 0] == low, 1, -1)).astype(np.int64)
-        return cls(ends, group, np.bincount(group), net)
+        start, end = ends[:, 0].astype(np.uint32), ends[:, 1].astype(np.uint32)
+        key = _pair(np.minimum(start, end), np.maximum(start, end))
+        order = np.argsort(key, kind="stable")
+        first = np.flatnonzero(_new(key[order]))
+        upward = np.where(start < end, 1, -1)[order]
+        return cls(
+            ends,
+            order,
+            uses=np.diff(first, append=len(order)),
+            net=np.add.reduceat(upward, first),
+        )
+
+    def rows(self, which: np.ndarray) -> np.ndarray:
+        """The rows, ascending, of the edges for which ``which`` [E] bool holds."""
+        return np.sort(self.order[np.repeat(which, self.uses)])
 
 
 def drop_collapsed(mesh: Triangles, notes: list[str]) -> Triangles:
@@ -90,9 +179,9 @@ def drop_doubled(mesh: Triangles, notes: list[str]) -> Triangles:
     Two copies that face apart are an inner wall between touching bodies: both go. Where most of
     the mesh is doubled, the file was written two-sided: one copy stays.
     """
-    ranked = np.sort(mesh.faces, axis=1)
-    order = np.lexsort(ranked.T[::-1])
-    new = np.concatenate([[True], np.any(ranked[order][1:] != ranked[order][:-1], axis=1)])
+    if not _may_repeat(mesh.faces):
+        return mesh
+    order, new = _sorted_rows(np.sort(mesh.faces, axis=1).astype(np.int32))
     if new.all():
         return mesh
     group = np.empty(len(order), np.int64)
@@ -115,15 +204,32 @@ def drop_doubled(mesh: Triangles, notes: list[str]) -> Triangles:
     return Triangles(mesh.points, faces)
 
 
+def _may_repeat(faces: np.ndarray) -> bool:
+    """Whether two faces may have the same three vertices: their hashes are sorted, not they."""
+    a, b, c = (faces[:, corner].astype(np.uint64) for corner in range(3))
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    code = low << np.uint64(32) | (a + b + c - low - high)
+    code *= _HASH_FACTOR
+    code ^= code >> np.uint64(32)
+    code ^= high
+    code *= _HASH_FACTOR
+    code.sort()
+    return bool(np.any(code[1:] == code[:-1]))
+
+
 def areas(corners: np.ndarray) -> np.ndarray:
     """Areas [F] of triangles [F, 3, 3]."""
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return 0.5 * np.linalg.norm(cross, axis=1)
 
 
-def signed_volume(corners: np.ndarray) -> float:
-    """Signed volume inside closed triangles [F, 3, 3], about their own middle for accuracy."""
-    a, b, c = np.moveaxis(corners - corners.mean(axis=(0, 1), keepdims=True), 1, 0)
+def signed_volume(corners: np.ndarray, *, about: np.ndarray | None = None) -> float:
+    """Signed volume between triangles [F, 3, 3] and a point near them, for accuracy.
+
+    Where the triangles are closed, any point will do: their own middle if none is given.
+    """
+    middle = corners.mean(axis=(0, 1)) if about is None else about
+    a, b, c = np.moveaxis(corners - middle, 1, 0)
     return float(np.sum(a * np.cross(b, c))) / 6
 
 
