@@ -18,6 +18,8 @@ from experiments.timing import Bench, Figure
 from experiments.vane_pairs import VanePairs
 from vanejax import compilation_cache
 
+NEAR_ZERO_S = 1.0  # a later process traces the step again, which no cache spares
+
 
 def compilation(bench: Bench) -> Iterator[Figure]:
     """The step of training: with an empty compilation cache, then with a full one."""
@@ -34,7 +36,7 @@ def compilation(bench: Bench) -> Iterator[Figure]:
                 times.append(json.loads(text))
     for name, times, goal_s in (
         ("compilation of a step, first process", cold, 8.0),
-        ("compilation of a step, later process", cached, None),
+        ("compilation of a step, later process", cached, NEAR_ZERO_S),
     ):
         seconds = [entry["trace"] + entry["compile"] for entry in times]
         middle = sorted(times, key=lambda entry: entry["compile"])[len(times) // 2]
