@@ -18,7 +18,7 @@ from vanejax.model_file import TrainedMatcher, load_model
 from vanejax.rigid import RigidTransform
 
 NOISE_MM, START_DEG, START_MM = 0.1, 5.0, 5.0
-LONG_S = 10.0  # from here on compilation and cold caches hardly count
+LONG_S = 10.0  # from here on cold caches hardly count
 PIXELS = 128  # across, of the scans that are only counted
 
 
@@ -104,7 +104,10 @@ class Bench:
         return seconds, result
 
     def time_sparingly(self, function: Callable[[], Any]) -> list[float]:
-        """Seconds of each repeat as `time`; what takes longer than `LONG_S` is run once only."""
+        """Seconds of each repeat as `time`; what takes longer than `LONG_S` is run once only.
+
+        For what compiles nothing.
+        """
         began = time.perf_counter()
         function()
         first = time.perf_counter() - began
