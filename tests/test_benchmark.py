@@ -301,10 +301,10 @@ def test_every_cost_has_its_series(once: Bench, monkeypatch) -> None:
     series = list(growing.scaling(once, sizes))
     assert all(isinstance(one, Series) and len(one.sizes) == 2 for one in series)
     assert [one.unit for one in series] == (
-        ["faces"] * 4 + ["pixels"] + ["points"] * 3 + ["neighbours", "pairs"]
+        ["faces"] * 4 + ["pixels"] + ["points"] * 4 + ["neighbours", "pairs"]
     )
     assert series[0].sizes == [22_976, 91_904]
-    assert {pairs.sources for pairs in asked[:6]} == {32, 64}
+    assert {pairs.sources for pairs in asked[:4]} == {32, 64}
     assert {pairs.batch for pairs in asked[-4:]} == {1, 2}
 
 

@@ -22,6 +22,7 @@ from vanejax.locate import register
 from vanejax.measured_scan import MeasuredScan
 from vanejax.part import Part, load_part
 from vanejax.refine import refine
+from vanejax.scan_file import load_scan, save_points
 from vanejax.scanner import Scanner
 
 
@@ -120,21 +121,26 @@ def over_resolution(bench: Bench, resolutions: tuple[float, ...]) -> Series:
 
 
 def over_points(bench: Bench, counts: tuple[int, ...]) -> Iterator[Series]:
-    """Refining and registering more and more measured points of one view."""
-    refining, registrations = [], []
-    for count in counts:
-        points = measured_points(bench, count)
-        scan = MeasuredScan(points, None, np.zeros(3), f"{count} points")
-        refining.append(
-            bench.time_sparingly(functools.partial(refine, bench.views.model, points, bench.rough))
-        )
-        registrations.append(
-            bench.time_sparingly(
-                functools.partial(register, scan, bench.views.part, init=bench.rough)
-            )
-        )
-    yield Series("refine, points", "points", counts, refining)
-    yield Series("register from a rough pose, points", "points", counts, registrations)
+    """Reading, refining and registering more and more measured points of one view."""
+    part, start = bench.views.part, bench.rough
+    seconds: dict[str, list[list[float]]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scan.ply"
+        for count in counts:
+            points = measured_points(bench, count)
+            save_points(path, points)
+            scan = MeasuredScan(points, None, np.zeros(3), f"{count} points")
+            runs: dict[str, Callable[[], Any]] = {
+                "read a scan, points": functools.partial(load_scan, path),
+                "refine, points": functools.partial(refine, bench.views.model, points, start),
+                "register from a rough pose, points": functools.partial(
+                    register, scan, part, init=start
+                ),
+            }
+            for name, run in runs.items():
+                seconds.setdefault(name, []).append(bench.time_sparingly(run))
+    for name, times in seconds.items():
+        yield Series(name, "points", counts, times)
 
 
 def measured_points(bench: Bench, count: int) -> np.ndarray:
