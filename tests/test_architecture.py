@@ -20,6 +20,7 @@ LAYERS = [
     "errors",
     "whole_file",
     "array_file",
+    "rigid_transform",
     "rigid",
     "pointcloud",
     # host: parts

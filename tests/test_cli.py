@@ -488,3 +488,36 @@ def test_help_and_version_need_nothing_heavy() -> None:
     assert "--sensor-origin" in done.stdout
     for heavy in ("numpy", "jax", "trimesh", "scipy", "matplotlib"):
         assert f"'{heavy}'" not in done.stdout
+
+
+def modules_after(program: str, folder: Path) -> set[str]:
+    """The top-level packages that a program has loaded at its end."""
+    program += "; import sys; print('\\n', *{name.split('.')[0] for name in sys.modules})"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=folder, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def test_importing_the_package_loads_nothing_heavy(tmp_path) -> None:
+    loaded = modules_after("import vanejax", tmp_path)
+    assert "vanejax" in loaded
+    assert not loaded & {"numpy", "scipy", "jax", "flax", "trimesh", "matplotlib"}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["inspect", "scan.ply"],
+        ["inspect", "wedge.stl"],
+    ],
+    ids=" ".join,
+)
+def test_who_needs_no_network_does_not_wait_for_jax(files, tmp_path, arguments) -> None:
+    arguments = [str(files / word) if "." in word else word for word in arguments]
+    program = f"from vanejax.cli import main; assert main({arguments}) in (0, 3, 4)"
+    loaded = modules_after(program, tmp_path)
+    assert "numpy" in loaded
+    assert not loaded & {"jax", "flax", "matplotlib"}

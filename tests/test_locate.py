@@ -27,7 +27,7 @@ from example_scans import (
 from scipy.spatial.transform import Rotation
 
 import vanejax
-from vanejax import locate
+from vanejax import locate, matched_poses
 from vanejax.camera import Camera, look_at
 from vanejax.errors import InputError
 from vanejax.locate import register
@@ -357,7 +357,7 @@ def test_what_the_network_finds_is_followed(monkeypatch):
         asked.append(len(guesses.rotation))
         return batch(disturbed(bracket(), truth, 3, 3, seed=0))
 
-    monkeypatch.setattr(locate, "match_poses", good)
+    monkeypatch.setattr(matched_poses, "match_poses", good)
     monkeypatch.setattr(locate, "STARTS", ())  # no search by ray casting
     result = register(points, bracket(), weights=a_matcher(bracket()))
     assert_right(result, bracket(), truth)
@@ -376,7 +376,7 @@ def test_a_network_that_finds_nothing_does_no_harm(monkeypatch):
         away = guesses.rotation @ np.array([0.0, 0.0, 1000.0])  # a metre farther off
         return RigidTransform(guesses.rotation, guesses.translation + away)
 
-    monkeypatch.setattr(locate, "match_poses", useless)
+    monkeypatch.setattr(matched_poses, "match_poses", useless)
     result = register(points, bracket(), weights=a_matcher(bracket()))
     assert_right(result, bracket(), truth)
     near = disturbed(bracket(), truth, 5, 5, seed=0)

@@ -312,3 +312,34 @@ def test_nearest_rotation_maximises_the_trace(determinant):
     np.testing.assert_allclose(np.trace(best.T @ matrix), expected, atol=ROUNDING)
     np.testing.assert_allclose(best.T @ best, np.eye(3), atol=ROUNDING)
     check_grads(jax.jit(nearest_rotation), (jnp.asarray(matrix),), order=1, modes=["fwd", "rev"])
+
+
+def test_a_motion_is_immutable_and_can_be_copied_with_changes():
+    motion = random_motion(0)
+    with pytest.raises(AttributeError):
+        motion.translation = np.zeros(3)
+    with pytest.raises(AttributeError):
+        motion.shift = np.zeros(3)
+    at_origin = motion.replace(translation=np.zeros(3))
+    np.testing.assert_array_equal(at_origin.rotation, motion.rotation)
+    np.testing.assert_array_equal(at_origin.translation, 0)
+    assert motion.translation.any()
+
+
+def test_a_motion_is_a_pytree_of_its_two_arrays():
+    batch = random_motion(0, (4,), jnp)
+    paths = [jax.tree_util.keystr(place) for place, _ in jax.tree.leaves_with_path(batch)]
+    assert paths == [".rotation", ".translation"]
+    alone = jax.jit(jax.vmap(lambda motion: motion.inverse()))(batch)
+    assert isinstance(alone, RigidTransform)
+    assert_same(alone, batch.inverse())
+
+
+def test_a_product_with_a_motion_of_jax_is_one_of_jax_at_full_precision():
+    host, device = random_motion(0), random_motion(1, xp=jnp)
+    for motion in (host @ device, device @ host):
+        assert isinstance(motion.rotation, jax.Array)
+    text = str(jax.make_jaxpr(lambda a, b: a @ b)(host, device))
+    assert text.count("precision=(Precision.HIGHEST, Precision.HIGHEST)") == text.count(
+        "dot_general"
+    )

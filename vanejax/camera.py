@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from vanejax.errors import InputError
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 
 FORMULAS = ("sphere", "printed")
 TEST_AZIMUTH_STEP_DEG = 40.0

@@ -17,7 +17,7 @@ from vanejax.camera import Camera, Viewpoints
 from vanejax.errors import InputError
 from vanejax.part import Part
 from vanejax.pointcloud import voxel_thin
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 from vanejax.scanner import Scan, scan_views
 
 FORMAT = "vanejax scan set"

@@ -7,14 +7,13 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vanejax.covariance import uncertainty
 from vanejax.errors import InputError
-from vanejax.matched_poses import icosahedral_rotations, match_poses
 from vanejax.measured_scan import MeasuredScan, clean_scan
-from vanejax.model_file import TrainedMatcher, load_model
 from vanejax.part import Part, load_part
 from vanejax.pose_result import Alternative, PoseResult
 from vanejax.pose_search import (
@@ -32,12 +31,15 @@ from vanejax.pose_search import (
 )
 from vanejax.refine import descend, refine, subset
 from vanejax.residuals import MeasurementModel, RayCasting, SurfaceMatching
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 from vanejax.scan_file import load_scan
 from vanejax.scanner import Scanner
 from vanejax.surface import Surface
 from vanejax.verdict import Limits, Rival, judge
 from vanejax.verification import View, evidence, verify
+
+if TYPE_CHECKING:
+    from vanejax.model_file import TrainedMatcher
 
 RIVALS = 8  # poses beside the best that are followed to their end and compared with it
 RIVAL_POINTS = 8_000
@@ -94,6 +96,8 @@ def register(
         if not isinstance(part, Part):
             part = load_part(part, units=units_cad, must_be_closed=False)
         if isinstance(weights, str | os.PathLike):
+            from vanejax.model_file import load_model
+
             weights = load_model(weights)
         if weights is not None:
             weights.check_part(part)
@@ -169,6 +173,8 @@ def _sources(
 ) -> Iterator[Candidates]:
     """Candidates from the guess; else from RPM-Net; else from more and more rotations."""
     points = scan.points
+    if weights is not None:  # it brings JAX, which takes a second that others need not wait
+        from vanejax.matched_poses import icosahedral_rotations, match_poses
     if init is not None:
         guesses = _batch(init)
         if weights is not None:

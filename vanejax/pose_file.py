@@ -18,7 +18,7 @@ import numpy as np
 
 from vanejax.errors import InputError
 from vanejax.pose_result import PointStatus, PoseResult, Uncertainty, Verification
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 from vanejax.whole_file import write_text
 
 FORMAT = "vanejax pose"

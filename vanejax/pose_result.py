@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 
 Status = Literal["accepted", "ambiguous", "rejected"]
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from vanejax.part import Part
 from vanejax.refine import descend, subset
 from vanejax.residuals import MeasurementModel, RayCasting
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 from vanejax.surface import Surface
 from vanejax.verification import View, evidence
 

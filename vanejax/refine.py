@@ -15,7 +15,7 @@ from vanejax.covariance import inflation, patches_of
 from vanejax.noise import LEAST_COSINE, Noise, fit_noise, weights
 from vanejax.pose_result import Refinement
 from vanejax.residuals import MeasurementModel, Precision, RayCasting, moved
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 
 COARSE_POINTS = 4_000
 MEDIUM_POINTS = 20_000

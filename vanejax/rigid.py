@@ -1,8 +1,7 @@
 """Rigid motions: the group SE(3), its exponential, and the best motion between two point sets.
 
-Frames live in names: ``part_from_camera.apply(points_camera)`` gives points in the part's frame,
-and ``a_from_b @ b_from_c`` is ``a_from_c``. The class works on numpy arrays (float64 on the host)
-and on JAX arrays alike; every free function is JAX, pure, and written for any leading batch shape.
+`RigidTransform`, which knows no JAX, is offered here as well. Every function is JAX, pure, and
+written for any leading batch shape.
 """
 
 from __future__ import annotations
@@ -10,72 +9,29 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-Array = jax.Array | np.ndarray
+from vanejax.rigid_transform import RigidTransform
+
+__all__ = [
+    "RigidTransform",
+    "euler_xyz_deg",
+    "exp_se3",
+    "exp_so3",
+    "hat",
+    "log_se3",
+    "log_so3",
+    "nearest_rotation",
+    "rotation_angle",
+    "vee",
+    "weighted_procrustes",
+]
 
 
-def _matmul(a: Array, b: Array) -> Array:
+def _matmul(a: jax.Array, b: jax.Array) -> jax.Array:
     """Matrix product at full precision: TF32 on a GPU would cost 1e-3 of a coordinate."""
-    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-        return a @ b
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
-
-
-@flax.struct.dataclass
-class RigidTransform:
-    """A rotation followed by a translation: ``x_a = rotation @ x_b + translation``.
-
-    Attributes:
-      rotation: [..., 3, 3] f32 or f64, orthonormal with determinant +1.
-      translation: [..., 3] same dtype, in the unit of the points it is applied to.
-    """
-
-    rotation: Array
-    translation: Array
-
-    @classmethod
-    def identity(cls, batch: tuple[int, ...] = (), dtype: Any = np.float32) -> RigidTransform:
-        """The motion that moves nothing, as numpy arrays with leading shape ``batch``."""
-        rotation = np.broadcast_to(np.eye(3, dtype=dtype), (*batch, 3, 3))
-        return cls(rotation=rotation, translation=np.zeros((*batch, 3), dtype))
-
-    @classmethod
-    def from_matrix(cls, matrix: Array) -> RigidTransform:
-        """From [..., 3, 4] or homogeneous [..., 4, 4] matrices."""
-        return cls(rotation=matrix[..., :3, :3], translation=matrix[..., :3, 3])
-
-    def as_matrix(self) -> Array:
-        """Homogeneous [..., 4, 4] matrices."""
-        xp = np if isinstance(self.rotation, np.ndarray) else jnp
-        top = xp.concatenate([self.rotation, self.translation[..., None]], axis=-1)
-        bottom = xp.broadcast_to(xp.asarray([0, 0, 0, 1], top.dtype), (*top.shape[:-2], 1, 4))
-        return xp.concatenate([top, bottom], axis=-2)
-
-    def apply(self, points: Array) -> Array:
-        """Moves points [..., N, 3]."""
-        return self.rotate(points) + self.translation[..., None, :]
-
-    def rotate(self, vectors: Array) -> Array:
-        """Turns directions [..., N, 3], for example normals."""
-        return _matmul(vectors, self.rotation.swapaxes(-1, -2))
-
-    def inverse(self) -> RigidTransform:
-        """``a_from_b.inverse()`` is ``b_from_a``."""
-        rotation = self.rotation.swapaxes(-1, -2)
-        translation = -_matmul(rotation, self.translation[..., None])[..., 0]
-        return RigidTransform(rotation=rotation, translation=translation)
-
-    def __matmul__(self, other: RigidTransform) -> RigidTransform:
-        """Composition: ``a_from_b @ b_from_c`` is ``a_from_c``."""
-        turned = _matmul(self.rotation, other.translation[..., None])[..., 0]
-        return RigidTransform(
-            rotation=_matmul(self.rotation, other.rotation),
-            translation=turned + self.translation,
-        )
 
 
 def hat(omega: jax.Array) -> jax.Array:

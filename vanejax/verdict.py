@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 
 from vanejax.pose_result import Refinement, Uncertainty, Verdict, Verification
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 
 from vanejax.pose_result import PointStatus, Verification
 from vanejax.residuals import MeasurementModel, RayCasting, Residuals
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 
 MOST_CELLS = 64  # along the longer side of the scan's view
 POINTS_PER_CELL = 3.0

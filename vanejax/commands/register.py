@@ -59,7 +59,6 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
       InputError: an argument or a file that cannot be used.
     """
-    from vanejax import compilation_cache
     from vanejax.commands.pose_summary import summary, verdict_line
 
     started = time.perf_counter()
@@ -79,11 +78,12 @@ def run(arguments: argparse.Namespace) -> int:
         part_extent_mm=part.extent_mm,
         sensor_origin=origin,
     )
-    compilation_cache.enable()
     matcher = None
     if arguments.weights is not None:
+        from vanejax import compilation_cache
         from vanejax.model_file import load_model
 
+        compilation_cache.enable()
         matcher = load_model(arguments.weights)
         matcher.check_part(part)
 

@@ -19,7 +19,7 @@ from vanejax.plotting.canvas import (
 )
 from vanejax.plotting.scene import Picture, Scene, reader_rotation, show
 from vanejax.pose_result import PointStatus, PoseResult, Verification
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 
 # blue below the surface, red above it; ColorBrewer's scale, safe for every kind of colour vision
 DEVIATION_COLORMAP = "RdYlBu_r"

@@ -21,7 +21,7 @@ from vanejax.part import Part
 from vanejax.plotting.canvas import INK
 from vanejax.plotting.clouds import READER_AZIMUTH_DEG, READER_ELEVATION_DEG
 from vanejax.plotting.shading import shade
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 from vanejax.scanner import Scan, Scanner
 
 PART_METAL = "#b4bcc8"

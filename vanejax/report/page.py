@@ -40,7 +40,7 @@ from vanejax.report.wording import (
     percent,
     significant,
 )
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 
 _PACKAGES = ("vanejax", "jax", "numpy", "scipy", "embreex", "trimesh")
 _MOST_PICTURES = 6

@@ -26,7 +26,7 @@ from vanejax.plotting.deviation import (
     overlay_rotation,
 )
 from vanejax.pose_result import PoseResult
-from vanejax.rigid import RigidTransform
+from vanejax.rigid_transform import RigidTransform
 
 MAX_VERTICES = 65_535
 MAX_POINTS = 60_000
