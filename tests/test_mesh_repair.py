@@ -279,6 +279,24 @@ def test_far_from_the_origin_single_precision_is_too_coarse():
         repaired(*both(box(at=(2e4, 0, 0))))
 
 
+def test_vertices_that_meet_by_the_thousand_are_not_paired_one_by_one(monkeypatch):
+    """A cone whose faces share no vertex: all of its tips are less than a micrometre apart."""
+    count = 60
+    turn = 2 * np.pi * np.arange(count + 1) / count
+    rim = np.stack([50 * np.cos(turn), 50 * np.sin(turn), 0 * turn], axis=1)
+    tips = np.array([0, 0, 40]) + np.random.default_rng(0).uniform(-2e-5, 2e-5, (count, 3))
+    side = np.stack([rim[:-1], rim[1:], tips], axis=1)
+    base = np.stack([rim[1:], rim[:-1], np.zeros((count, 3))], axis=1)
+    soup = np.concatenate([side, base]).reshape(-1, 3)
+    faces = np.arange(len(soup)).reshape(-1, 3)
+    cone, notes = repaired(soup, faces)
+    assert "welded" in notes
+    assert cone.is_watertight
+    monkeypatch.setattr(mesh_repair, "MAX_PAIRS", count)  # there are count^2 / 2
+    with pytest.raises(InputError, match="open edges"):
+        repaired(soup, faces)
+
+
 def test_too_many_faces_and_bodies_are_refused(monkeypatch):
     many = both(*(box((1, 1, 1), at=(2 * i, 0, 0)) for i in range(257)))
     with pytest.raises(InputError, match="257 separate bodies"):

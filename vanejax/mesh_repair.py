@@ -25,6 +25,8 @@ MAX_OPEN_EDGES = 20_000  # more is no crack but a surface that was never closed
 SMALL_HOLE = 0.05  # of the part's diagonal: what is filled without asking
 SLIT_AREA = 1e-9  # of the diagonal squared: a crack along which nothing is missing
 WELD = 1e-5  # of the part's diagonal: 1.5 micrometres on a 150 mm part, below any scanner
+# within reach of each other at open edges, or 8 for each vertex there: more is dust, not a crack
+MAX_PAIRS = 25_000_000
 MAX_ROUNDING_MM = 1e-3  # the scanner's promised range error
 
 
@@ -141,9 +143,12 @@ def _weld_open_edges(mesh: Triangles, notes: list[str]) -> Triangles:
     if not len(rim):
         return mesh
     reach = WELD * mesh.diagonal()
-    pairs = scipy.spatial.cKDTree(mesh.points[rim]).query_pairs(reach, output_type="ndarray")
-    if not len(pairs):
+    tree = scipy.spatial.cKDTree(mesh.points[rim])
+    # counted before they are listed, since n vertices at one place are n^2 / 2 pairs
+    count = (tree.count_neighbors(tree, reach) - len(rim)) // 2
+    if not 0 < count <= max(MAX_PAIRS, 8 * len(rim)):
         return mesh
+    pairs = tree.query_pairs(reach, output_type="ndarray")
     _, cluster = connected(pairs, len(rim))
     lowest = np.full(cluster.max() + 1, len(mesh.points))
     np.minimum.at(lowest, cluster, rim)
