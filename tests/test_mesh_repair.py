@@ -297,6 +297,12 @@ def test_vertices_that_meet_by_the_thousand_are_not_paired_one_by_one(monkeypatc
         repaired(soup, faces)
 
 
+def test_a_face_that_welding_collapses_is_refused_as_any_other():
+    sliver = np.array([[0.0, 0, 0], [100, 0, 0], [0, 1e-4, 0]])  # narrower than the welding's reach
+    with pytest.raises(InputError, match="every face is collapsed"):
+        repair_solid(sliver, np.array([[0, 1, 2]]), name="part")
+
+
 def test_too_many_faces_and_bodies_are_refused(monkeypatch):
     many = both(*(box((1, 1, 1), at=(2 * i, 0, 0)) for i in range(257)))
     with pytest.raises(InputError, match="257 separate bodies"):

@@ -52,12 +52,13 @@ def repair_solid(
     mesh = _checked(vertices, faces, name)
     mesh = drop_collapsed(mesh, notes)
     mesh = drop_doubled(mesh, notes)
+    if len(mesh.faces):
+        mesh = _weld_open_edges(mesh, notes)
     if not len(mesh.faces):
         raise InputError(
             f"{name}: every face is collapsed to a line or a point; "
             "export the part again as one solid body"
         )
-    mesh = _weld_open_edges(mesh, notes)
     mesh, body = wind_consistently(mesh, name, notes)
     if np.any(mesh.edges.net):
         filled = drop_collapsed(weld(_fill_holes(mesh, name, notes)), [])
