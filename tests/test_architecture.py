@@ -65,6 +65,7 @@ LAYERS = [
     # JAX: training
     "pairs",
     "losses",
+    "accumulation",
     "metrics",
     "training",
     "checkpoint",

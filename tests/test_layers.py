@@ -6,10 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 
-from vanejax.models.layers import DenseNormRelu, DenseNormReluMax, dense_max
+from vanejax.models.layers import (
+    DenseNormRelu,
+    DenseNormReluCloudMax,
+    DenseNormReluMax,
+    cloud_max,
+    neighbor_sums,
+    product,
+    product_moments,
+)
 
-N, K, C, FEATURES = 7, 5, 6, 16
+N, K, C, WIDE, FEATURES = 7, 5, 6, 12, 16
 EXACT = 1e-12  # f64 eps x a sum of 100 terms x the scale of the norm
 
 
@@ -49,18 +58,22 @@ def run(layer, params, x, mask):
 
 
 @pytest.mark.parametrize("num_groups", [1, 8, FEATURES])
-@pytest.mark.parametrize("shape", [(N, C), (N, K, C), (1, C)])
+@pytest.mark.parametrize("shape", [(N, C), (N, K, C), (1, C), (N, K, WIDE), (N, WIDE), (1, WIDE)])
 def test_dense_norm_relu_is_torch_s(shape, num_groups):
-    x = cloud(*shape)
-    found = run(DenseNormRelu(FEATURES, num_groups), parameters(), x, np.ones(shape[0], bool))
-    np.testing.assert_allclose(found, torch_layer(x, parameters(), num_groups), atol=EXACT)
+    """Narrow inputs go through their moments, wide ones do not."""
+    x, params = cloud(*shape), parameters(shape[-1])
+    found = run(DenseNormRelu(FEATURES, num_groups), params, x, np.ones(shape[0], bool))
+    # the variance is a difference of moments of inputs up to 10: eps x 100 x 16
+    np.testing.assert_allclose(found, torch_layer(x, params, num_groups), atol=10 * EXACT)
 
 
 @pytest.mark.parametrize("num_groups", [1, 8, FEATURES])
-@pytest.mark.parametrize("shape", [(N, C), (N, K, C)])
-def test_dense_norm_relu_max_is_torch_s(shape, num_groups):
+@pytest.mark.parametrize(
+    ("layer", "shape"), [(DenseNormReluCloudMax, (N, C)), (DenseNormReluMax, (N, K, C))]
+)
+def test_dense_norm_relu_max_is_torch_s(layer, shape, num_groups):
     x = cloud(*shape)
-    found = run(DenseNormReluMax(FEATURES, num_groups), parameters(), x, np.ones(shape[:-1], bool))
+    found = run(layer(FEATURES, num_groups), parameters(), x, np.ones(N, bool))
     expected = torch_layer(x, parameters(), num_groups).max(axis=-2)
     assert found.shape == (*shape[:-2], FEATURES)
     # the variance is a difference of moments of inputs up to 10: eps x 100 x 16
@@ -71,12 +84,12 @@ def test_single_precision_agrees_too():
     """The moments of the narrow input lose few digits, even beside a bias of 3."""
     params = jax.tree.map(np.float32, parameters())
     x = cloud(N, K, C).astype(np.float32)
-    for layer, mask, reduce in (
-        (DenseNormRelu(FEATURES), np.ones(N, bool), lambda y: y),
-        (DenseNormReluMax(FEATURES), np.ones((N, K), bool), lambda y: y.max(axis=1)),
+    for layer, reduce in (
+        (DenseNormRelu(FEATURES), lambda y: y),
+        (DenseNormReluMax(FEATURES), lambda y: y.max(axis=1)),
     ):
         with jax.enable_x64(False):
-            found = run(layer, params, x, mask)
+            found = run(layer, params, x, np.ones(N, bool))
         assert found.dtype == jnp.float32
         expected = reduce(torch_layer(x.astype(float), parameters(), 8))
         np.testing.assert_allclose(found, expected, atol=2e-5)  # f32 eps x 160
@@ -94,90 +107,126 @@ def scattered(x: np.ndarray, mask: np.ndarray, junk: float) -> np.ndarray:
 def test_padding_changes_nothing_and_has_no_gradient(padding, junk):
     rng = np.random.default_rng(padding)
     mask = rng.permutation(np.arange(N + padding) < N)
-    rows = mask[:, None] & np.ones((1, K), bool)
-    x = cloud(N, K, C)
-    padded = scattered(x, rows, junk)
-    for layer, given, expected in (
-        (DenseNormRelu(FEATURES), mask, torch_layer(x, parameters(), 8)),
-        (DenseNormReluMax(FEATURES), rows, torch_layer(x, parameters(), 8).max(axis=1)),
+    for layer, shape, reduce in (
+        (DenseNormRelu(FEATURES), (N, K, C), lambda y: y),
+        (DenseNormRelu(FEATURES), (N, K, WIDE), lambda y: y),
+        (DenseNormReluMax(FEATURES), (N, K, C), lambda y: y.max(axis=1)),
+        (DenseNormReluCloudMax(FEATURES), (N, C), lambda y: y.max(axis=0)),
     ):
-        variables = {"params": parameters()}
+        x, params = cloud(*shape), parameters(shape[-1])
+        rows = jnp.broadcast_to(
+            jnp.expand_dims(mask, range(1, x.ndim - 1)), (len(mask), *shape[1:-1])
+        )
+        padded = scattered(x, np.asarray(rows), junk)
+        of_points = not isinstance(layer, DenseNormReluCloudMax)
 
         @jax.jit
-        def both(padded, layer=layer, variables=variables, given=given):
+        def both(padded, layer=layer, params=params, of_points=of_points):
             def total(padded):
-                y = layer.apply(variables, padded, given)
-                return jnp.sum(jnp.where(jnp.expand_dims(mask, range(1, y.ndim)), y, 0) ** 2), y
+                y = layer.apply({"params": params}, padded, mask)
+                seen = jnp.expand_dims(mask, range(1, y.ndim)) if of_points else True
+                return jnp.sum(jnp.where(seen, y, 0) ** 2), y
 
             return jax.value_and_grad(total, has_aux=True)(padded)
 
         (_, found), gradient = both(padded)
-        np.testing.assert_allclose(found[mask], expected, atol=10 * EXACT)
+        expected = reduce(torch_layer(x, params, 8))
+        np.testing.assert_allclose(found[mask] if of_points else found, expected, atol=10 * EXACT)
         assert np.isfinite(found).all()
         np.testing.assert_array_equal(gradient[~mask], 0)
         assert np.abs(gradient[mask]).max() > 0
-        if isinstance(layer, DenseNormReluMax):
-            np.testing.assert_array_equal(found[~mask], 0)
 
 
-def test_the_fused_layer_has_the_gradient_of_its_parts():
+@pytest.mark.parametrize("fused", [DenseNormReluMax, DenseNormReluCloudMax])
+def test_the_fused_layer_has_the_gradient_of_its_parts(fused):
     """Through the max, the moments, and gains of both signs."""
-    x, rows = cloud(N, K, C), np.ones((N, K), bool)
+    x = cloud(N, K, WIDE) if fused is DenseNormReluMax else cloud(N, WIDE)
+    mask = np.ones(N, bool)
 
-    def fused(params, x):
-        y = DenseNormReluMax(FEATURES).apply({"params": params}, x, rows)
-        return jnp.sum(jnp.sin(y))
+    def found(params, x):
+        return jnp.sum(jnp.sin(fused(FEATURES).apply({"params": params}, x, mask)))
 
     def plain(params, x):
-        y = DenseNormRelu(FEATURES).apply({"params": params}, x, rows[:, 0])
-        return jnp.sum(jnp.sin(jnp.max(y, axis=1)))
+        y = DenseNormRelu(FEATURES).apply({"params": params}, x, mask)
+        return jnp.sum(jnp.sin(jnp.max(y, axis=-2)))
 
-    args = (parameters(), x)
-    found = jax.jit(jax.grad(fused, (0, 1)))(*args)
-    expected = jax.jit(jax.grad(plain, (0, 1)))(*args)
+    args = (parameters(WIDE), x)
     # eps x 1e4: inputs of 10 squared, and a dense bias whose gradient cancels to zero
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-11), found, expected)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-11),
+        jax.jit(jax.grad(found, (0, 1)))(*args),
+        jax.jit(jax.grad(plain, (0, 1)))(*args),
+    )
 
 
-@pytest.mark.parametrize("points", [1, 37, 90])  # below, across and over several chunks
-def test_dense_max_is_the_maximum_of_the_product(points):
-    """In f32 at the network's own widths: its gradient finds the winners by recomputing them."""
-    rng = np.random.default_rng(points)
-    x = rng.normal(size=(points, 32, 96)).astype(np.float32)
-    kernel = rng.normal(size=(96, 192)).astype(np.float32) / 10
-    mask = rng.uniform(size=(points, 32)) < 0.8
-    mask[0] = False
-    x[-1, 1] = x[-1, 0]  # equal maxima
-    weights = rng.normal(size=(points, 192)).astype(np.float32) * mask.any(axis=1, keepdims=True)
+@pytest.mark.parametrize("shape", [(N, C), (N, K, C), (N, WIDE)])
+def test_gradients_of_a_layer_are_those_of_finite_differences(shape):
+    mask = np.arange(N) < N - 2
+    params, x = parameters(shape[-1]), cloud(*shape)
 
-    def plain(x, kernel):
-        product = jnp.where(mask[..., None], jnp.matmul(x, kernel), -1e30)
-        return jnp.max(product, axis=1)
+    def smooth(params, x):
+        y = DenseNormRelu(FEATURES).apply({"params": params}, x, mask)
+        return jnp.sum(jnp.sin(y[: N - 2]))
+
+    check_grads(smooth, (params, x), order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
+
+
+def test_the_product_has_the_gradient_of_a_product():
+    rng = np.random.default_rng(0)
+    check_grads(product, (rng.normal(size=(N, K, C)), rng.normal(size=(C, 4))), 1, ["rev"])
+
+
+def test_moments_of_a_product_are_those_of_its_rows():
+    rng = np.random.default_rng(0)
+    x, kernel, mask = cloud(N, K, C), rng.normal(size=(C, 9)), np.arange(N) != 3
+    rows = (x[mask] @ kernel).reshape(-1, 9)
+    mean, variance = jax.jit(product_moments)(x, kernel, mask)
+    np.testing.assert_allclose(mean, rows.mean(axis=0), atol=EXACT)
+    np.testing.assert_allclose(variance, rows.var(axis=0), atol=100 * EXACT)  # of about 100
+
+
+def test_equal_maxima_share_the_gradient():
+    """As `jnp.max` does: neighbourhoods are filled up with copies of a point."""
+    y = np.random.default_rng(0).normal(size=(N, K, C))
+    y[:, 3] = y[:, 1]
+    y[2] = 1.5
+    weights = np.random.default_rng(1).normal(size=(2, N, C))
 
     def pulled(function):
-        def pull(x, kernel):
-            top, vjp = jax.vjp(function, x, kernel)
-            return top, vjp(weights.astype(top.dtype))
+        return jax.jit(jax.grad(lambda y: sum(map(jnp.vdot, function(y), weights))))(y)
 
-        return jax.jit(pull)
+    found = pulled(neighbor_sums)
+    np.testing.assert_allclose(found, pulled(lambda y: (y.max(1), (y * y).sum(1))), atol=EXACT)
 
-    with jax.enable_x64(False):
-        top, (d_x, d_kernel) = pulled(lambda x, kernel: dense_max(x, kernel, mask))(x, kernel)
-    # the winner of the f32 product is that of the f64 product unless two lie within 1e-6
-    want, (want_x, want_kernel) = pulled(plain)(x.astype(float), kernel.astype(float))
-    np.testing.assert_allclose(top, want, rtol=1e-5, atol=1e-5)  # f32 eps x 96 terms
-    np.testing.assert_array_equal(d_x[~mask], 0)
-    np.testing.assert_allclose(d_x, want_x, atol=1e-4)  # f32 eps x 192 terms of up to 1
-    np.testing.assert_allclose(d_kernel, want_kernel, atol=1e-3)  # and of 90 points
+
+def test_the_maximum_of_a_cloud_and_its_gradient():
+    rng = np.random.default_rng(0)
+    x, kernel, mask = rng.normal(size=(N, C)), rng.normal(size=(C, 9)), np.arange(N) != 3
+
+    def plain(x, kernel):
+        return jnp.max(jnp.where(mask[:, None], x @ kernel, -jnp.inf), axis=0)
+
+    def pulled(function):
+        top, pull = jax.vjp(function, x, kernel)
+        return top, *pull(jnp.arange(1.0, 10.0))
+
+    for found, expected in zip(
+        pulled(lambda x, kernel: cloud_max(x, kernel, mask)), pulled(plain), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, atol=EXACT)
 
 
 def test_an_empty_cloud_stays_finite():
-    x = np.zeros((N, K, C))
-    for layer, mask in (
-        (DenseNormRelu(FEATURES), np.zeros(N, bool)),
-        (DenseNormReluMax(FEATURES), np.zeros((N, K), bool)),
+    for layer, shape in (
+        (DenseNormRelu(FEATURES), (N, K, C)),
+        (DenseNormRelu(FEATURES), (N, K, WIDE)),
+        (DenseNormReluMax(FEATURES), (N, K, C)),
+        (DenseNormReluCloudMax(FEATURES), (N, C)),
     ):
-        gradient = jax.jit(
-            jax.grad(lambda p, layer=layer, mask=mask: layer.apply({"params": p}, x, mask).sum())
-        )(parameters())
+
+        def total(params, layer=layer, shape=shape):
+            y = layer.apply({"params": params}, np.zeros(shape), np.zeros(N, bool))
+            return jnp.sum(y)
+
+        gradient = jax.jit(jax.grad(total))(parameters(shape[-1]))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))

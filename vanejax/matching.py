@@ -5,6 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+# A round changes the sums by a factor of at most N + 1, so that this many stay within f32's range.
+_ROUNDS = 5
+
 
 def log_sinkhorn(
     affinity: jax.Array, source_mask: jax.Array, target_mask: jax.Array, *, iterations: int
@@ -12,9 +15,10 @@ def log_sinkhorn(
     """Alternating normalisation of rows and columns in the log domain, with slack.
 
     A slack row and a slack column of affinity 0 take up the points that have no partner; the
-    slack itself is never normalised (RPM-Net, section 4.1; Sinkhorn, 1964). Written with the two
-    potentials ``u`` and ``v``, so that only [N] and [M] vectors change from round to round:
-    ``log P = A - u - v``, ``u = logsumexp_j(A - v, 0)``, ``v = logsumexp_i(A - u, 0)``.
+    slack itself is never normalised (RPM-Net, section 4.1; Sinkhorn, 1964). In the log domain that
+    is ``u_i = log(1 + sum_j exp(A_ij - v_j))``, ``v_j = log(1 + sum_i exp(A_ij - u_i))``, with
+    ``A - u - v`` as the answer, and costs N x M exponentials for each sum. Here they are taken once
+    for several rounds, as ``E = exp(A - u - v)``, and a sum is the product of E with a vector.
 
     Args:
       affinity: [N, M] f32, larger for better partners.
@@ -29,19 +33,18 @@ def log_sinkhorn(
     real = source_mask[:, None] & target_mask[None, :]
     # exp(-1e9) is exactly 0 in f32, and unlike -inf it never makes a NaN in a gradient.
     affinity = jnp.where(real, affinity, -1e9)
-    v = jnp.zeros(affinity.shape[1], affinity.dtype)
-    u = jnp.zeros(affinity.shape[0], affinity.dtype)
-    for _ in range(iterations):
-        u = _logsumexp_with_slack(affinity - v[None, :], axis=1)
-        v = _logsumexp_with_slack(affinity - u[:, None], axis=0)
+    # The largest entry of each row becomes 1: what underflows is nothing beside the slack.
+    u = jax.lax.stop_gradient(jnp.maximum(jnp.max(affinity, axis=1), 0.0))
+    v = jnp.zeros_like(affinity[0])
+    exact = jax.lax.Precision.HIGHEST  # TF32 on a GPU would leave rows that sum to 1.001
+    for first in range(0, iterations, _ROUNDS):
+        scaled = jnp.exp(affinity - u[:, None] - v[None, :])
+        row_slack, column_slack, columns = jnp.exp(-u), jnp.exp(-v), jnp.ones_like(v)
+        for _ in range(min(_ROUNDS, iterations - first)):
+            rows = row_slack + jnp.matmul(scaled, 1 / columns, precision=exact)
+            columns = column_slack + jnp.matmul(1 / rows, scaled, precision=exact)
+        u, v = u + jnp.log(rows), v + jnp.log(columns)
     return affinity - u[:, None] - v[None, :]
-
-
-def _logsumexp_with_slack(x: jax.Array, axis: int) -> jax.Array:
-    """log(1 + sum(exp(x))) along ``axis``, shifted by the largest term."""
-    top = jax.lax.stop_gradient(jnp.maximum(jnp.max(x, axis), 0.0))
-    shifted = jnp.exp(x - jnp.expand_dims(top, axis))
-    return top + jnp.log(jnp.exp(-top) + jnp.sum(shifted, axis))
 
 
 def soft_correspondences(

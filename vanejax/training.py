@@ -7,6 +7,7 @@ bit-equal to an unbroken one and there is nothing to resume but the state.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -16,9 +17,11 @@ import jax.numpy as jnp
 import optax
 
 from vanejax import losses
+from vanejax.accumulation import accumulate
 from vanejax.metrics import rotation_error_deg, translation_error
 from vanejax.models.rpmnet import Match, RpmNet
 from vanejax.pairs import Drawing, Pair, ScanBank, draw_pairs
+from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 
 Metrics = dict[str, jax.Array]
@@ -55,7 +58,7 @@ class RpmNetLoss:
       matching_sigma: its width, unit-sphere units.
       partner: factor of `losses.partner_loss`; 0 as published.
       pairs_at_once: pairs of a batch that are computed side by side: 1 suits the caches of a CPU,
-        the whole batch a GPU. It changes rounding only.
+        the whole batch a GPU. It should divide the batch, and changes rounding only.
     """
 
     iterations: int = 2
@@ -89,26 +92,47 @@ class RpmNetLoss:
         """
         # Once for the batch: the reference is the same for every view.
         features = model.apply(variables, pairs.target, method="features")
+        weights = self.discount ** jnp.arange(self.iterations - 1.0, -1.0, -1.0)
 
-        def of_pair(source: Any, truth: RigidTransform) -> tuple[jax.Array, Metrics]:
+        def of_pair(
+            shared: tuple[Variables, jax.Array], source: PointCloud, truth: RigidTransform
+        ) -> tuple[jax.Array, Metrics]:
             pair = Pair(source=source, target=pairs.target, target_from_source=truth)
-            matches = model.apply(
-                variables, source, pair.target, RigidTransform.identity(), self.iterations, features
-            )
-            total = jnp.zeros(())
-            for index, match in enumerate(matches):
-                value, parts = self.of_match(match, source, pair)
-                total += self.discount ** (self.iterations - 1 - index) * value
-            return total, parts | pose_metrics(matches[-1].target_from_source, truth)
+            near = model.apply(variables, source, method="neighborhoods")
 
-        # Forward again in the backward pass: a third cheaper on a CPU than reading the activations
-        # of several pairs back from memory, and a quarter of the memory.
-        total, metrics = jax.lax.map(
-            jax.checkpoint(lambda pair: of_pair(*pair)),
+            def iteration(
+                shared: tuple[Variables, jax.Array], pose: RigidTransform, weight: jax.Array
+            ) -> tuple[jax.Array, RigidTransform, Metrics]:
+                variables, features = shared
+                match = model.apply(
+                    variables, source, near, pair.target, features, pose, method="match"
+                )
+                value, parts = self.of_match(match, source, pair)
+                pose = match.target_from_source
+                return weight * value, pose, parts | pose_metrics(pose, truth)
+
+            # the published network does not differentiate through the pose either
+            init = jax.tree.map(jnp.asarray, RigidTransform.identity())
+            total, _, metrics = accumulate(iteration, shared, init, weights)
+            return total, jax.tree.map(lambda leaf: leaf[-1], metrics)
+
+        def some_pairs(
+            shared: tuple[Variables, jax.Array], carry: tuple[()], some: tuple
+        ) -> tuple[jax.Array, tuple[()], Metrics]:
+            if at_once == 1:
+                total, metrics = of_pair(shared, *jax.tree.map(lambda leaf: leaf[0], some))
+                return total, carry, metrics
+            totals, metrics = jax.vmap(of_pair, in_axes=(None, 0, 0))(shared, *some)
+            return jnp.sum(totals), carry, metrics
+
+        batch = pairs.source.mask.shape[0]
+        at_once = math.gcd(batch, self.pairs_at_once)
+        some = jax.tree.map(
+            lambda leaf: leaf.reshape(batch // at_once, at_once, *leaf.shape[1:]),
             (pairs.source, pairs.target_from_source),
-            batch_size=self.pairs_at_once,
         )
-        return jnp.mean(total), jax.tree.map(jnp.mean, metrics)
+        total, _, metrics = accumulate(some_pairs, (variables, features), (), some)
+        return total / batch, jax.tree.map(jnp.mean, metrics)
 
 
 def pose_metrics(found: RigidTransform, truth: RigidTransform) -> Metrics:
@@ -135,7 +159,8 @@ def make_optimizer(
         decay_steps=max(steps, warmup_steps + 1),
         end_value=final_fraction * learning_rate,
     )
-    return optax.chain(optax.clip_by_global_norm(clip_norm), optax.adam(schedule))
+    # flat: some dozens of leaves would be updated, and compiled, one by one
+    return optax.flatten(optax.chain(optax.clip_by_global_norm(clip_norm), optax.adam(schedule)))
 
 
 def init_state(

@@ -1,48 +1,19 @@
 """Layers for unordered points, aware of padding.
 
 Group normalisation runs over all real points of one cloud and over the channels of a group (Wu and
-He, 2018). It is affine per channel, ``y * scale + shift``: the layers below use that to touch the
-large [N, K, C] arrays as rarely as they can.
+He, 2018). It is affine per channel, ``y * scale + shift``, and both follow from the mean and the
+variance of each channel. The layers differ in where they take those from, and in what they spare
+the large [N, K, C] arrays. A mask is applied to what is narrow or already reduced, never to those.
 """
 
 from __future__ import annotations
-
-import math
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 _EPSILON = 1e-5  # PyTorch's default, under which RPM-Net was trained
-
-
-class GroupNorm(nn.Module):
-    """From sums per channel to the affine map that group normalisation amounts to.
-
-    Attributes:
-      num_groups: must divide the number of channels.
-    """
-
-    num_groups: int
-
-    @nn.compact
-    def __call__(
-        self, total: jax.Array, total_squared: jax.Array, count: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Scale and shift [C] from sums [C] over ``count`` [] rows of y and of y^2."""
-        channels = total.shape[0]
-        gain = self.param("scale", nn.initializers.ones, (channels,))
-        bias = self.param("bias", nn.initializers.zeros, (channels,))
-        size = channels // self.num_groups
-
-        def group_mean(per_channel: jax.Array) -> jax.Array:
-            grouped = jnp.sum(per_channel.reshape(self.num_groups, size), axis=1)
-            return jnp.repeat(grouped / (count * size), size)
-
-        mean = group_mean(total)
-        variance = jnp.maximum(group_mean(total_squared) - mean**2, 0.0)
-        scale = gain * jax.lax.rsqrt(variance + _EPSILON)
-        return scale, bias - mean * scale
+_EXACT = jax.lax.Precision.HIGHEST  # for variances, which are differences
 
 
 class Linear(nn.Module):
@@ -57,6 +28,45 @@ class Linear(nn.Module):
         return kernel, self.param("bias", nn.initializers.zeros, (self.features,))
 
 
+class GroupNorm(nn.Module):
+    """The affine map that group normalisation amounts to.
+
+    Attributes:
+      features: C, channels.
+      num_groups: must divide the number of channels.
+    """
+
+    features: int
+    num_groups: int
+
+    def setup(self) -> None:
+        """Gain and bias [C]."""
+        self.gain = self.param("scale", nn.initializers.ones, (self.features,))
+        self.bias = self.param("bias", nn.initializers.zeros, (self.features,))
+
+    def sign(self) -> jax.Array:
+        """[C], -1 where the map falls, else 1: the sign of its scale; a constant."""
+        return jnp.where(self.gain >= 0, 1.0, -1.0).astype(self.gain.dtype)
+
+    def __call__(
+        self, mean: jax.Array, variance: jax.Array, offset: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Scale and shift [C] of y, so that ``y * scale + shift`` is the normalised ``y + offset``.
+
+        ``mean`` and ``variance`` [C] are those of y. The dense layer's bias is the offset: left out
+        of y, it costs the variance no digits.
+        """
+        size = self.features // self.num_groups
+
+        def over_group(per_channel: jax.Array) -> jax.Array:
+            return jnp.repeat(jnp.mean(per_channel.reshape(self.num_groups, size), axis=1), size)
+
+        center = over_group(mean + offset)
+        spread = over_group(jnp.maximum(variance, 0.0) + (mean + offset - center) ** 2)
+        scale = self.gain * jax.lax.rsqrt(spread + _EPSILON)
+        return scale, self.bias + (offset - center) * scale
+
+
 class DenseNormRelu(nn.Module):
     """A dense layer on every point, group normalisation, ReLU."""
 
@@ -65,25 +75,36 @@ class DenseNormRelu(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array) -> jax.Array:
-        """From x [N, ..., C] with mask [N] to [N, ..., features]."""
+        """From x [N, C] or [N, K, C] with mask [N] to [..., features]."""
         kernel, bias = Linear(self.features, name="dense")(x.shape[-1])
-        lead = (1,) * (x.ndim - 1)
-        y = x @ kernel + bias.reshape(*lead, -1)
-        axes = tuple(range(y.ndim - 1))
-        kept = jnp.where(mask.reshape(-1, *(1,) * (y.ndim - 1)), y, 0.0)
-        count = jnp.maximum(jnp.sum(mask), 1) * (y[0, ..., 0].size)
-        scale, shift = GroupNorm(self.num_groups, name="norm")(
-            jnp.sum(kept, axes), jnp.sum(kept * kept, axes), count
+        return norm_relu(
+            x, kernel, bias, GroupNorm(self.features, self.num_groups, name="norm"), mask
         )
-        return nn.relu(y * scale.reshape(*lead, -1) + shift.reshape(*lead, -1))
+
+
+def norm_relu(
+    x: jax.Array, kernel: jax.Array, bias: jax.Array, norm: GroupNorm, mask: jax.Array
+) -> jax.Array:
+    """ReLU of the normalised ``x @ kernel + bias``, see `DenseNormRelu`.
+
+    Where x is much narrower than the product, the moments of x give those of the product, and the
+    normalisation goes into the kernel: the product is written once, as the answer.
+    """
+    lead = (1,) * (x.ndim - 1)
+    if 2 * x.shape[-1] <= kernel.shape[1]:
+        scale, shift = norm(*product_moments(x, kernel, mask), bias)
+        return nn.relu(product(x, kernel * scale[None, :]) + shift.reshape(*lead, -1))
+    y = product(x, kernel)
+    total, squared = (y, y * y) if y.ndim == 2 else (jnp.sum(y, 1), jnp.sum(y * y, 1))
+    scale, shift = norm(*_moments_of_sums(total, squared, mask, y.size // total.size), bias)
+    return nn.relu(y * scale.reshape(*lead, -1) + shift.reshape(*lead, -1))
 
 
 class DenseNormReluMax(nn.Module):
-    """`DenseNormRelu`, then the maximum over the axis before the channels, in one.
+    """`DenseNormRelu`, then the maximum over the neighbours.
 
-    Two facts spare the passes over the widest array: the maximum commutes with the normalisation
-    (monotone once the sign of the gain is in the kernel), and the sums that the normalisation
-    needs follow from the first and second moments of the narrower input.
+    The maximum commutes with the normalisation, which is monotone per channel: where it falls, the
+    kernel's sign is turned first.
     """
 
     features: int
@@ -91,90 +112,149 @@ class DenseNormReluMax(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array) -> jax.Array:
-        """From x [..., K, C] with mask [..., K] to [..., features]; 0 where no row is real."""
-        channels = x.shape[-1]
-        kernel, bias = Linear(self.features, name="dense")(channels)
-        rows = jnp.where(mask[..., None], x, 0.0).reshape(-1, channels)
-        count = jnp.maximum(jnp.sum(mask), 1).astype(x.dtype)
-        mean = jnp.sum(rows, 0) / count
-        exact = jax.lax.Precision.HIGHEST  # the variance is a difference of these
-        second = jnp.matmul(rows.T, rows, precision=exact) / count
-        covariance = second - mean[:, None] * mean[None, :]
-        mean_y = jnp.matmul(mean, kernel, precision=exact) + bias
-        variance_y = jnp.sum(kernel * jnp.matmul(covariance, kernel, precision=exact), 0)
-        scale, shift = GroupNorm(self.num_groups, name="norm")(
-            mean_y, jnp.maximum(variance_y, 0.0) + mean_y**2, jnp.ones(())
-        )
-        sign = jnp.where(scale >= 0, 1.0, -1.0)
-        signed = kernel * jax.lax.stop_gradient(sign)[None, :]
-        top = dense_max(x, signed, mask)
-        lead = (1,) * (top.ndim - 1)
-        slope = jnp.abs(scale).reshape(*lead, -1)
-        return nn.relu(top * slope + (shift + bias * scale).reshape(*lead, -1))
+        """From x [N, K, C] with mask [N] to [N, features]."""
+        kernel, bias = Linear(self.features, name="dense")(x.shape[-1])
+        norm = GroupNorm(self.features, self.num_groups, name="norm")
+        top, squared = neighbor_sums(product(x, kernel * norm.sign()[None, :]))
+        total = product(jnp.sum(x, 1), kernel)
+        scale, shift = norm(*_moments_of_sums(total, squared, mask, x.shape[1]), bias)
+        return nn.relu(top * jnp.abs(scale)[None, :] + shift[None, :])
 
 
-_CHUNK_ROWS = 512  # of x: with its products it stays in a core's cache
+class DenseNormReluCloudMax(nn.Module):
+    """`DenseNormRelu`, then the maximum over all points of the cloud."""
+
+    features: int
+    num_groups: int = 8
+
+    @nn.compact
+    def __call__(self, x: jax.Array, mask: jax.Array) -> jax.Array:
+        """From x [N, C] with mask [N] to [features]; 0 where no point is real."""
+        kernel, bias = Linear(self.features, name="dense")(x.shape[-1])
+        norm = GroupNorm(self.features, self.num_groups, name="norm")
+        scale, shift = norm(*product_moments(x, kernel, mask), bias)
+        top = cloud_max(x, kernel * norm.sign()[None, :], mask)
+        return nn.relu(top * jnp.abs(scale) + shift)
 
 
-def dense_max(x: jax.Array, kernel: jax.Array, mask: jax.Array) -> jax.Array:
-    """``max_k (x @ kernel)`` over real rows, without ever writing the product out.
+def _moments_of_sums(
+    total: jax.Array, squared: jax.Array, mask: jax.Array, rows: int
+) -> tuple[jax.Array, jax.Array]:
+    """Mean and variance [C] of y from the sums [N, C] of y and y^2 over the rows of each point."""
+    count = rows * jnp.maximum(jnp.sum(mask), 1)
+    mean = jnp.sum(total, 0, where=mask[:, None]) / count
+    return mean, jnp.sum(squared, 0, where=mask[:, None]) / count - mean**2
+
+
+def product_moments(
+    x: jax.Array, kernel: jax.Array, mask: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Mean and variance [C'] of ``x @ kernel`` over real rows, from the moments of x.
 
     Args:
-      x: [..., K, C] f32.
-      kernel: [C, C'] f32.
-      mask: [..., K] bool.
-
-    Returns:
-      [..., C'] f32, -1e30 where no row is real. In the gradient equal maxima share alike, as in
-      `jnp.max`.
+      x: [N, C] or [N, K, C].
+      kernel: [C, C'].
+      mask: [N].
     """
-    *lead, rows, channels = x.shape
-    points = math.prod(lead)
-    size = max(1, _CHUNK_ROWS // rows)
-    chunks = -(-points // size)
-    pad = chunks * size - points
-    flat = jnp.pad(x.reshape(points, rows, channels), ((0, pad), (0, 0), (0, 0)))
-    real = jnp.pad(mask.reshape(points, rows), ((0, pad), (0, 0)))
-    top = _chunked_dense_max(
-        flat.reshape(chunks, size, rows, channels), kernel, real.reshape(chunks, size, rows)
-    )
-    return top.reshape(chunks * size, -1)[:points].reshape(*lead, kernel.shape[1])
+    real = mask.reshape(-1, *(1,) * (x.ndim - 1))
+    rows = jnp.where(real, x, 0.0).reshape(-1, x.shape[-1])
+    count = jnp.maximum(jnp.sum(mask), 1) * (rows.shape[0] // x.shape[0])
+    mean = jnp.sum(rows, 0) / count
+    second = jnp.matmul(rows.T, rows, precision=_EXACT) / count
+    covariance = second - mean[:, None] * mean[None, :]
+    spread = jnp.matmul(covariance, kernel, precision=_EXACT)
+    return jnp.matmul(mean, kernel, precision=_EXACT), jnp.sum(kernel * spread, 0)
 
 
 @jax.custom_vjp
-def _chunked_dense_max(x: jax.Array, kernel: jax.Array, mask: jax.Array) -> jax.Array:
-    """From x [chunks, points, K, C] to [chunks, points, C']."""
-    return jax.lax.map(lambda chunk: jnp.max(_masked_product(chunk, kernel), -2), (x, mask))
+def product(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """``x @ kernel`` of x [..., C] with kernel [C, C'].
 
-
-def _masked_product(chunk: tuple[jax.Array, jax.Array], kernel: jax.Array) -> jax.Array:
-    x, mask = chunk
-    return jnp.where(mask[..., None], x @ kernel, -1e30)
-
-
-def _dense_max_forward(x: jax.Array, kernel: jax.Array, mask: jax.Array) -> tuple:
-    return _chunked_dense_max(x, kernel, mask), (x, kernel, mask)
-
-
-def _dense_max_backward(saved: tuple, gradient: jax.Array) -> tuple:
-    """Recomputes each chunk's product: cheaper than reading it back from memory.
-
-    The maxima are those of this product, not of the forward one: another kernel may round
-    differently, and then no row would equal its maximum.
+    Its gradient multiplies in the order that copies the narrower of two large arrays.
     """
-    x, kernel, mask = saved
-
-    def body(d_kernel: jax.Array, chunk: tuple) -> tuple[jax.Array, jax.Array]:
-        x, mask, gradient = chunk
-        product = _masked_product((x, mask), kernel)
-        winner = (product == jnp.max(product, -2, keepdims=True)) & mask[..., None]
-        count = jnp.maximum(jnp.sum(winner, -2, dtype=x.dtype), 1.0)
-        d_product = jnp.where(winner, (gradient / count)[..., None, :], 0.0)
-        d_kernel += jnp.einsum("pkc,pkd->cd", x, d_product)
-        return d_kernel, d_product @ kernel.T
-
-    d_kernel, d_x = jax.lax.scan(body, jnp.zeros_like(kernel), (x, mask, gradient))
-    return d_x, d_kernel, None
+    return x @ kernel
 
 
-_chunked_dense_max.defvjp(_dense_max_forward, _dense_max_backward)
+def _product_forward(x: jax.Array, kernel: jax.Array) -> tuple:
+    return x @ kernel, (x, kernel)
+
+
+def _product_backward(saved: tuple, d_y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    x, kernel = saved
+    rows, d_rows = x.reshape(-1, x.shape[-1]), d_y.reshape(-1, d_y.shape[-1])
+    return (d_rows @ kernel.T).reshape(x.shape), rows.T @ d_rows
+
+
+product.defvjp(_product_forward, _product_backward)
+
+
+@jax.custom_vjp
+def neighbor_sums(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Maximum of y and sum of y^2 over the neighbours.
+
+    Args:
+      y: [N, K, C].
+
+    Returns:
+      Two arrays [N, C]. In the gradient equal maxima share alike, as in `jnp.max`.
+    """
+    return jnp.max(y, 1), jnp.sum(y * y, 1)
+
+
+def _sums_forward(y: jax.Array) -> tuple:
+    top, squared = neighbor_sums(y)
+    return (top, squared), (y, top)
+
+
+def _sums_backward(saved: tuple, cotangents: tuple) -> tuple[jax.Array]:
+    """One pass to count the winners and one for the gradient."""
+    y, top = saved
+    d_top, d_squared = cotangents
+    winner = y == top[:, None, :]
+    share = d_top / jnp.sum(winner, 1, dtype=jnp.int32)
+    d_y = jnp.where(winner, share[:, None, :], 0.0)
+    return (d_y + 2.0 * d_squared[:, None, :] * y,)
+
+
+neighbor_sums.defvjp(_sums_forward, _sums_backward)
+
+
+@jax.custom_vjp
+def cloud_max(x: jax.Array, kernel: jax.Array, mask: jax.Array) -> jax.Array:
+    """``max_n (x @ kernel)`` over real rows.
+
+    Args:
+      x: [N, C].
+      kernel: [C, C'].
+      mask: [N].
+
+    Returns:
+      [C'], -1e30 where no row is real. The gradient goes to the last of several equal maxima, and
+      costs the C' winning rows instead of two products of the whole.
+    """
+    return jnp.max(_real_product(x, kernel, mask), 0)
+
+
+def _real_product(x: jax.Array, kernel: jax.Array, mask: jax.Array) -> jax.Array:
+    """``x @ kernel``, with padding sunk to -1e30 by a channel of its own: no pass to mask it."""
+    padded = jnp.where(mask, 0.0, 1.0).astype(x.dtype)[:, None]
+    x = jnp.concatenate([jnp.where(mask[:, None], x, 0.0), padded], 1)
+    return x @ jnp.concatenate([kernel, jnp.full_like(kernel[:1], -1e30)])
+
+
+def _cloud_max_forward(x: jax.Array, kernel: jax.Array, mask: jax.Array) -> tuple:
+    x, mask = jnp.asarray(x), jnp.asarray(mask)  # a tracer indexes them in the backward pass
+    y = _real_product(x, kernel, mask)
+    top = jnp.max(y, 0)
+    place = jnp.arange(len(y), dtype=jnp.int32)[:, None]
+    return top, (x, kernel, mask, jnp.max(jnp.where(y == top[None, :], place, 0), 0))
+
+
+def _cloud_max_backward(saved: tuple, d_top: jax.Array) -> tuple:
+    x, kernel, mask, winner = saved
+    d_top = jnp.where(mask[winner], d_top, 0.0)  # where no row is real
+    d_x = jnp.zeros_like(x).at[winner].add((kernel * d_top[None, :]).T)
+    return d_x, (x[winner] * d_top[:, None]).T, None
+
+
+cloud_max.defvjp(_cloud_max_forward, _cloud_max_backward)

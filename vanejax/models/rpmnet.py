@@ -23,23 +23,17 @@ import numpy as np
 from vanejax.errors import InputError
 from vanejax.features import point_pair_features
 from vanejax.matching import log_sinkhorn, soft_correspondences
-from vanejax.models.layers import DenseNormRelu, DenseNormReluMax
+from vanejax.models.layers import (
+    DenseNormRelu,
+    DenseNormReluCloudMax,
+    DenseNormReluMax,
+    GroupNorm,
+    Linear,
+    norm_relu,
+)
 from vanejax.pointcloud import PointCloud, ball_query
 from vanejax.registration import Register, Registration
 from vanejax.rigid import RigidTransform, weighted_procrustes
-
-
-@flax.struct.dataclass
-class Neighborhoods:
-    """What the feature network knows of each point's surroundings.
-
-    Attributes:
-      offsets: [N, K, 3] f32, neighbour minus point.
-      ppf: [N, K, 4] f32, point-pair features, rigid-invariant.
-    """
-
-    offsets: jax.Array
-    ppf: jax.Array
 
 
 @flax.struct.dataclass
@@ -63,21 +57,48 @@ class Match:
     beta: jax.Array
 
 
+class NeighborhoodLayer(nn.Module):
+    """`DenseNormRelu` of ``[xyz, turned offset, ppf]``; what is turned is the kernel."""
+
+    features: int
+
+    @nn.compact
+    def __call__(
+        self, xyz: jax.Array, near: jax.Array, rotation: jax.Array, mask: jax.Array
+    ) -> jax.Array:
+        """From xyz [N, 3], near [N, K, 7], rotation [3, 3] and mask [N] to [N, K, features]."""
+        kernel, bias = Linear(self.features, name="dense")(10)
+        exact = jax.lax.Precision.HIGHEST  # as wherever points are turned
+        of_offset = jnp.matmul(rotation.T, kernel[3:6], precision=exact)
+        turned = jnp.concatenate([kernel[:3], of_offset, kernel[6:]])
+        center = jnp.broadcast_to(xyz[:, None, :], (*near.shape[:2], 3))
+        norm = GroupNorm(self.features, num_groups=8, name="norm")
+        return norm_relu(jnp.concatenate([center, near], -1), turned, bias, norm, mask)
+
+
 class FeatureNet(nn.Module):
     """Local features: shared MLP over neighbours, max, MLP, unit length."""
 
     width: int = 96
 
     @nn.compact
-    def __call__(self, xyz: jax.Array, near: Neighborhoods, mask: jax.Array) -> jax.Array:
-        """From xyz [N, 3], neighbourhoods and mask [N] to features [N, width] f32."""
-        shape = (*near.offsets.shape[:2], 3)
-        center = jnp.broadcast_to(xyz[:, None, :], shape)
-        x = jnp.concatenate([center, near.offsets, near.ppf], -1)
-        x = DenseNormRelu(self.width, name="prepool_0")(x, mask)
+    def __call__(
+        self, xyz: jax.Array, near: jax.Array, rotation: jax.Array, mask: jax.Array
+    ) -> jax.Array:
+        """Features of a cloud that was moved after its neighbourhoods were found.
+
+        Args:
+          xyz: [N, 3] f32, where its points lie now.
+          near: [N, K, 7] f32, as `RpmNet.neighborhoods` found them.
+          rotation: [3, 3] f32, by which the cloud has turned since.
+          mask: [N] bool.
+
+        Returns:
+          [N, width] f32, unit length.
+        """
+        x = NeighborhoodLayer(self.width, name="prepool_0")(xyz, near, rotation, mask)
         x = DenseNormRelu(self.width, name="prepool_1")(x, mask)
-        rows = jnp.broadcast_to(mask[:, None], shape[:2])
-        x = DenseNormReluMax(2 * self.width, name="prepool_2")(x, rows)
+        x = DenseNormReluMax(2 * self.width, name="prepool_2")(x, mask)
         x = DenseNormRelu(2 * self.width, name="postpool_0")(x, mask)
         x = DenseNormRelu(self.width, name="postpool_1")(x, mask)
         x = nn.Dense(self.width, name="postpool_2")(x)
@@ -98,7 +119,7 @@ class AnnealingNet(nn.Module):
         x = jnp.concatenate([jnp.concatenate([source, target]), jnp.concatenate(flags)], -1)
         for index, features in enumerate((64, 64, 64, 128)):
             x = DenseNormRelu(features, name=f"prepool_{index}")(x, mask)
-        x = DenseNormReluMax(1024, num_groups=16, name="prepool_4")(x, mask)[None, :]
+        x = DenseNormReluCloudMax(1024, num_groups=16, name="prepool_4")(x, mask)[None, :]
         one = jnp.ones((1,), bool)
         x = DenseNormRelu(512, num_groups=16, name="postpool_0")(x, one)
         x = DenseNormRelu(256, num_groups=16, name="postpool_1")(x, one)
@@ -126,32 +147,34 @@ class RpmNet(nn.Module):
         self.feature_net = FeatureNet(self.feature_width)
         self.annealing_net = AnnealingNet()
 
-    def neighborhoods(self, cloud: PointCloud) -> Neighborhoods:
-        """Neighbours and point-pair features of a cloud [N]; no parameters take part."""
+    def neighborhoods(self, cloud: PointCloud) -> jax.Array:
+        """Offsets (neighbour minus point) and point-pair features of a cloud [N]: [N, K, 3 + 4].
+
+        No parameters take part, and the point-pair features stay as they are when the cloud moves.
+        """
         index = ball_query(
             cloud.xyz, cloud.mask, radius=self.radius, num_neighbors=self.num_neighbors
         )
         offsets = cloud.xyz[index] - cloud.xyz[:, None, :]
         ppf = point_pair_features(offsets, cloud.normals, cloud.normals[index])
-        return Neighborhoods(offsets=offsets, ppf=ppf)
+        return jnp.concatenate([offsets, ppf], -1)
 
     def features(self, cloud: PointCloud) -> jax.Array:
         """Features [M, feature_width] of a cloud: for the reference, once per part."""
-        return self.feature_net(cloud.xyz, self.neighborhoods(cloud), cloud.mask)
+        unturned = jnp.eye(3, dtype=cloud.xyz.dtype)
+        return self.feature_net(cloud.xyz, self.neighborhoods(cloud), unturned, cloud.mask)
 
     def match(
         self,
         source: PointCloud,
-        near: Neighborhoods,
+        near: jax.Array,
         target: PointCloud,
         target_features: jax.Array,
         target_from_source: RigidTransform,
     ) -> Match:
         """One iteration from the pose ``target_from_source``, which is held constant."""
         moved = target_from_source.apply(source.xyz)
-        turned = target_from_source.rotate(near.offsets.reshape(-1, 3))
-        moved_near = near.replace(offsets=turned.reshape(near.offsets.shape))
-        features = self.feature_net(moved, moved_near, source.mask)
+        features = self.feature_net(moved, near, target_from_source.rotation, source.mask)
         both = jnp.concatenate([source.mask, target.mask])
         beta, alpha = self.annealing_net(moved, target.xyz, both)
         # Features have unit length: |f - g|^2 = 2 - 2 f.g

@@ -1,0 +1,72 @@
+"""Sums over a loop whose gradient is taken while it runs forward."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+Body = Callable[[Any, Any, Any], tuple[jax.Array, Any, Any]]
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def accumulate(body: Body, shared: Any, carry: Any, xs: Any) -> tuple[jax.Array, Any, Any]:
+    """Sums ``value`` of ``value, carry, aux = body(shared, carry, x)`` over the leading axis of xs.
+
+    As `jax.lax.scan`, but differentiable in ``shared`` alone: carry and xs count as constants.
+    The gradient of each turn is taken right after its forward pass, while what it needs is still in
+    the caches, and one turn's memory serves them all. Plain reverse mode would keep the
+    intermediate values of every turn until the last one has run.
+
+    Args:
+      body: pure; closes over no value that is differentiated.
+      shared: pytree of floating point arrays, such as the parameters.
+      carry: what a turn leaves to the next.
+      xs: pytree with a leading axis of turns.
+
+    Returns:
+      The sum of the values [], the last carry, and the stacked aux.
+    """
+
+    def turn(total: tuple, x: Any) -> tuple:
+        value, carry = total
+        new, carry, aux = body(shared, carry, x)
+        return (value + new, carry), aux
+
+    (value, carry), aux = jax.lax.scan(turn, (jnp.zeros(()), carry), xs)
+    return value, carry, aux
+
+
+def _forward(body: Body, shared: Any, carry: Any, xs: Any) -> tuple:
+    # one long vector: a hundred leaves would be added, and compiled, one by one
+    flat, unflatten = ravel_pytree(shared)
+
+    def value_and_rest(flat: jax.Array, carry: Any, x: Any) -> tuple[jax.Array, tuple]:
+        value, carry, aux = body(unflatten(flat), carry, x)
+        return value, (carry, aux)
+
+    def turn(total: tuple, x: Any) -> tuple:
+        value, gradient, carry = total
+        (new, (carry, aux)), slope = jax.value_and_grad(value_and_rest, has_aux=True)(
+            flat, carry, x
+        )
+        return (value + new, gradient + slope, carry), aux
+
+    start = (jnp.zeros(()), jnp.zeros_like(flat), carry)
+    (value, gradient, carry), aux = jax.lax.scan(turn, start, xs)
+    return (value, carry, aux), (gradient, shared)
+
+
+def _backward(body: Body, saved: tuple, cotangents: tuple) -> tuple:
+    del body
+    gradient, shared = saved
+    _, unflatten = ravel_pytree(shared)
+    scale, _, _ = cotangents  # carry and aux are constants
+    return unflatten(scale * gradient), None, None
+
+
+accumulate.defvjp(_forward, _backward)
