@@ -27,6 +27,7 @@ from experiments.experiment import Experiment
 from experiments.run_folder import RunFolder, read_log
 from vanejax.checkpoint import Checkpoints, all_finite, restore_or
 from vanejax.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
+from vanejax.models.rpmnet import last_match
 from vanejax.pairs import Drawing, ScanBank, draw_pairs, make_bank
 from vanejax.part import Part
 from vanejax.pointcloud import PointCloud
@@ -215,9 +216,16 @@ def make_validation(
 
         def one(pair: tuple[PointCloud, RigidTransform]) -> Metrics:
             source, truth = pair
-            init, iterations = RigidTransform.identity(), config.model.test_iterations
-            matches = model.apply(variables, source, pairs.target, init, iterations, features)
-            return pose_metrics(matches[-1].target_from_source, truth)
+            match = last_match(
+                model,
+                variables,
+                source,
+                pairs.target,
+                RigidTransform.identity(),
+                iterations=config.model.test_iterations,
+                target_features=features,
+            )
+            return pose_metrics(match.target_from_source, truth)
 
         return jax.lax.map(one, (pairs.source, pairs.target_from_source))
 

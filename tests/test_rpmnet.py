@@ -14,7 +14,7 @@ import scipy.special
 from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
-from vanejax.models.rpmnet import RpmNet, rpmnet, variables_from_torch
+from vanejax.models.rpmnet import RpmNet, last_match, rpmnet, variables_from_torch
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.torch_weights import load_state_dict
@@ -253,6 +253,26 @@ def test_shared_reference_features_and_a_start_elsewhere():
     start = RigidTransform(first["rotation"], first["translation"])
     resume = jax.jit(functools.partial(MODEL.apply, exact_variables()), static_argnums=3)
     assert_matches(resume(source, target, start, 1, shared), slow_answer()[1:])
+
+
+def test_the_last_match_is_the_last_of_all():
+    xyz, normals, target_xyz, target_normals = single(*problem())
+    source, target = cloud(xyz, normals, N + 5), cloud(target_xyz, target_normals)
+    variables, init = random_variables(), RigidTransform.identity()
+    expected = run(MODEL, variables, source, target, 3)[-1]
+    last = jax.jit(functools.partial(last_match, MODEL, iterations=3))
+    found = last(variables, source, target, init)
+    shared = last(
+        variables,
+        source,
+        target,
+        init,
+        near=jax.jit(functools.partial(MODEL.apply, method="neighborhoods"))(variables, source),
+        target_features=features(MODEL, variables, target),
+    )
+    for match in (found, shared):
+        for a, b in zip(jax.tree.leaves(match), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)  # f32 eps x the condition
 
 
 # ---- the contract ----

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.measured_scan import MeasuredScan
 from vanejax.model_file import TrainedMatcher
-from vanejax.models.rpmnet import RpmNet
+from vanejax.models.rpmnet import RpmNet, last_match
 from vanejax.normals import estimate_normals
 from vanejax.pointcloud import PointCloud, voxel_thin
 from vanejax.refine import subset
@@ -94,18 +94,22 @@ def _follow(
 ) -> RigidTransform:
     """target_from_source [H] from each of ``inits`` [H].
 
-    What does not change with the pose is computed once for all. The iterations are a loop, not
-    five copies of the network to compile.
+    What does not change with the pose is computed once for all.
     """
     near = model.apply(variables, source, method=RpmNet.neighborhoods)
     features = model.apply(variables, target, method=RpmNet.features)
 
-    def step(pose: RigidTransform, _: None) -> tuple[RigidTransform, None]:
-        match = model.apply(variables, source, near, target, features, pose, method=RpmNet.match)
-        return match.target_from_source, None
-
     def one(init: RigidTransform) -> RigidTransform:
-        return jax.lax.scan(step, init, length=iterations)[0]
+        return last_match(
+            model,
+            variables,
+            source,
+            target,
+            init,
+            iterations=iterations,
+            near=near,
+            target_features=features,
+        ).target_from_source
 
     return jax.lax.map(one, inits, batch_size=at_once)
 

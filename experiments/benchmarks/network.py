@@ -12,6 +12,7 @@ from experiments import machine
 from experiments.flops import inference_flops, step_flops
 from experiments.timing import Bench, Figure
 from experiments.vane_pairs import VanePairs
+from vanejax.models.rpmnet import last_match
 from vanejax.pairs import Pair
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
@@ -98,9 +99,16 @@ def registering(pairs: VanePairs) -> Callable[[], RigidTransform]:
     def infer(
         variables: Any, source: PointCloud, target: PointCloud, features: jax.Array
     ) -> RigidTransform:
-        start = RigidTransform.identity()
-        matches = model.apply(variables, source, target, start, TEST_ITERATIONS, features)
-        return matches[-1].target_from_source
+        match = last_match(
+            model,
+            variables,
+            source,
+            target,
+            RigidTransform.identity(),
+            iterations=TEST_ITERATIONS,
+            target_features=features,
+        )
+        return match.target_from_source
 
     return lambda: jax.block_until_ready(infer(variables, pair.source, pair.target, features))
 

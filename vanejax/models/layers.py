@@ -232,19 +232,12 @@ def cloud_max(x: jax.Array, kernel: jax.Array, mask: jax.Array) -> jax.Array:
       [C'], -1e30 where no row is real. The gradient goes to the last of several equal maxima, and
       costs the C' winning rows instead of two products of the whole.
     """
-    return jnp.max(_real_product(x, kernel, mask), 0)
-
-
-def _real_product(x: jax.Array, kernel: jax.Array, mask: jax.Array) -> jax.Array:
-    """``x @ kernel``, with padding sunk to -1e30 by a channel of its own: no pass to mask it."""
-    padded = jnp.where(mask, 0.0, 1.0).astype(x.dtype)[:, None]
-    x = jnp.concatenate([jnp.where(mask[:, None], x, 0.0), padded], 1)
-    return x @ jnp.concatenate([kernel, jnp.full_like(kernel[:1], -1e30)])
+    return _cloud_max_forward(x, kernel, mask)[0]
 
 
 def _cloud_max_forward(x: jax.Array, kernel: jax.Array, mask: jax.Array) -> tuple:
     x, mask = jnp.asarray(x), jnp.asarray(mask)  # a tracer indexes them in the backward pass
-    y = _real_product(x, kernel, mask)
+    y = jnp.where(mask[:, None], x @ kernel, -1e30)
     top = jnp.max(y, 0)
     place = jnp.arange(len(y), dtype=jnp.int32)[:, None]
     return top, (x, kernel, mask, jnp.max(jnp.where(y == top[None, :], place, 0), 0))
