@@ -15,6 +15,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
+from jax.flatten_util import ravel_pytree
 
 from vanejax import losses
 from vanejax.accumulation import accumulate
@@ -231,7 +232,8 @@ def make_train_step(
         average = jax.tree.map(
             lambda old, new: decay * old + (1 - decay) * new, state.average, variables
         )
-        metrics = metrics | {"loss": value, "gradient_norm": optax.global_norm(gradients)}
+        norm = jnp.linalg.norm(ravel_pytree(gradients)[0])
+        metrics = metrics | {"loss": value, "gradient_norm": norm}
         new = TrainState(
             step=state.step + 1, variables=variables, average=average, opt_state=opt_state
         )
