@@ -34,6 +34,7 @@ LAYERS = [
     "airfoil",
     "vane",
     # host: scans and files
+    "envelope",
     "scanner",
     "dataset",
     "inert_pickle",
