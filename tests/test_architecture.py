@@ -35,6 +35,7 @@ LAYERS = [
     "vane",
     # host: scans and files
     "envelope",
+    "pixel_rays",
     "scanner",
     "dataset",
     "inert_pickle",

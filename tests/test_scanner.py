@@ -8,6 +8,7 @@ import scipy.spatial
 import trimesh
 
 from vanejax.camera import Camera, hemisphere_viewpoints, look_at
+from vanejax.envelope import Envelope, Window
 from vanejax.errors import InputError
 from vanejax.part import Part, part_from_mesh
 from vanejax.rigid import RigidTransform
@@ -174,6 +175,94 @@ def test_types_and_shapes_of_a_scan(ring):
         "hidden": ((len(scan.hidden), 3), "float32"),
     }
     assert scan.camera_from_part.rotation.dtype == np.float64
+
+
+def test_a_camera_far_away_sees_rims_as_sharply():
+    """From 100 m float32 turns a ray by 3e-3 mm, unless the ray starts before the part."""
+    part = solid(box((-40, -30, -5), (40, 30, 5)))
+    fov = np.degrees(2 * np.arctan(60 / 1e5))
+    camera = Camera(fov_x_deg=fov, fov_y_deg=fov, near_mm=1, far_mm=2e5)
+    pose = look_at(1e5 * np.array([0.43301, 0.25, 0.86603]), ORIGIN)
+    scan = Scanner(part).scan(camera, pose)
+    eye = pose.inverse().translation
+    row, column = np.divmod(np.arange(camera.width * camera.height), camera.width)
+    rays = pose.inverse().rotate(camera.ray_directions(column, row))
+    on_plane = eye + rays * ((5 - eye[2]) / rays[:, 2])[:, None]
+    beyond = (np.abs(on_plane[:, :2]) - [40, 30]).max(axis=-1)
+    top = np.zeros(len(rays), bool)
+    top[scan.pixel] = np.asarray(part.mesh.face_normals)[scan.face, 2] > 0.5
+    clear = np.abs(beyond) > 3e-5  # float32 near the part: a few roundings of 50 mm
+    assert (clear & (np.abs(beyond) < 3e-3)).sum() > 30
+    np.testing.assert_array_equal(top[clear], beyond[clear] < 0)
+
+
+def test_range_and_incidence_seen_from_above_are_analytic():
+    """Where acos in float32 would err by 0.02 deg: straight down on a plate, at 0 to 10 deg."""
+    camera = Camera(width=641, height=513)
+    scan = Scanner(solid(box((-60, -60, -5), (60, 60, 5)))).scan(camera, ABOVE)
+    row, column = np.divmod(scan.pixel, camera.width)
+    x, y = camera.slopes(column, row)
+    slope = np.hypot(x, y)
+    assert slope.min() == 0
+    np.testing.assert_allclose(
+        scan.incidence_deg, np.degrees(np.arctan(slope)), rtol=1e-7, atol=4e-6
+    )  # half a unit of a normal's float32 is 3e-8 rad, or 2e-6 deg
+    np.testing.assert_allclose(scan.range_mm, 395 * np.hypot(slope, 1), rtol=2e-7)  # f32
+    assert scan.range_mm is scan.range_mm  # computed once
+    assert scan.incidence_deg is scan.incidence_deg
+
+
+CAMERAS = {
+    "default": (Camera(), OBLIQUE),
+    "coarse": (Camera(width=80, height=64), OBLIQUE),
+    "wide": (Camera(width=400, height=300, fov_x_deg=110.0, fov_y_deg=90.0), ABOVE),
+    "partly outside": (
+        Camera().scaled(0.3),
+        look_at(np.array([0.0, 0, 400]), np.array([150.0, 90, 0])),
+    ),
+    "narrow": (Camera(width=300, height=300, fov_x_deg=5.0, fov_y_deg=4.0), OBLIQUE),
+    "cut by the near plane": (Camera(near_mm=395, far_mm=420).scaled(0.3), OBLIQUE),
+    "near": (Camera(near_mm=1).scaled(0.3), look_at(np.array([0.0, 70, 30]), ORIGIN)),
+    "partly behind": (
+        Camera(width=300, height=200, fov_x_deg=120.0, fov_y_deg=100.0, near_mm=1),
+        look_at(ORIGIN, np.array([1.0, 0.5, 0.2])),
+    ),
+}
+
+
+@pytest.mark.parametrize(("camera", "pose"), CAMERAS.values(), ids=CAMERAS)
+def test_casting_every_pixel_finds_no_more(ring, monkeypatch, camera, pose):
+    scanner = Scanner(ring)
+    scan = scanner.scan(camera, pose)
+    everywhere = [
+        Window(slice(row, row + 1), slice(0, camera.width)) for row in range(camera.height)
+    ]
+    monkeypatch.setattr(Envelope, "windows", lambda *_, **__: everywhere)
+    whole = scanner.scan(camera, pose)
+    assert len(scan.pixel) > 200
+    for name in ("pixel", "face", "points", "normals"):
+        np.testing.assert_array_equal(getattr(scan, name), getattr(whole, name))
+
+
+def test_more_faces_than_rays_and_chunks_of_faces(monkeypatch):
+    """Planes are then turned for each hit; and each chunk's are those of its own faces."""
+    fine = trimesh.creation.torus(35, 14, major_sections=32, minor_sections=20)
+    fine.vertices += np.random.default_rng(3).normal(0, 0.5, fine.vertices.shape)
+    part, camera = solid(fine), Camera(width=40, height=32)
+    row, column = np.divmod(np.arange(40 * 32), 40)
+    rays = OBLIQUE.inverse().rotate(camera.ray_directions(column, row))
+    eye = np.broadcast_to(OBLIQUE.inverse().translation, rays.shape)
+    expected = moller_trumbore(part, eye, rays)
+    monkeypatch.setattr("vanejax.scanner.FACES_AT_ONCE", 7)
+    scan = Scanner(part).scan(camera, OBLIQUE)
+    assert 80 < len(scan.pixel) < len(part.mesh.faces) / 5
+    np.testing.assert_array_equal(scan.pixel, np.flatnonzero(np.isfinite(expected.min(axis=1))))
+    np.testing.assert_array_equal(scan.face, expected[scan.pixel].argmin(axis=1))
+    np.testing.assert_allclose(
+        scan.range_mm, expected.min(axis=1)[scan.pixel], atol=ROUNDING_MM, rtol=0
+    )
+    normals = OBLIQUE.rotate(np.asarray(part.mesh.face_normals)[scan.face])
+    np.testing.assert_allclose(scan.normals, normals, atol=2e-7)  # f32 eps x 2
 
 
 def test_a_box_shadows_the_plate_behind_it():
@@ -372,9 +461,10 @@ def test_rays_through_edges_and_vertices_do_not_slip_in():
         np.testing.assert_allclose(hits.distance_mm[found], expected[found], atol=1e-4, rtol=0)
 
 
-def test_pixels_that_look_at_vertices_do_not_see_the_inside():
+@pytest.mark.parametrize("near_mm", [50.0, 99.9])  # the latter cuts the envelope, not the part
+def test_pixels_that_look_at_vertices_do_not_see_the_inside(near_mm):
     """A relief with a vertex on every pixel's ray, and a post so near that rays start far away."""
-    camera = Camera(width=61, height=51, near_mm=50)
+    camera = Camera(width=61, height=51, near_mm=near_mm)
     row, column = np.divmod(np.arange(camera.width * camera.height), camera.width)
     depth = 400 + np.random.default_rng(0).uniform(-1, 1, row.size)
     x, y = camera.slopes(column, row)
@@ -433,6 +523,10 @@ def test_a_camera_inside_the_part_is_refused():
     scanner = Scanner(solid(trimesh.creation.icosphere(2, 1000.0)))
     with pytest.raises(InputError, match="inside the part test"):
         scanner.scan(Camera(), ABOVE)
+    with pytest.MonkeyPatch.context() as patch:  # the largest face need not be in the first chunk
+        patch.setattr("vanejax.scanner.FACES_AT_ONCE", 7)
+        with pytest.raises(InputError, match="inside the part test"):
+            scanner.scan(Camera(), ABOVE)
     # in the hole of a ring it is not inside, though within the part's bounding sphere
     ring = Scanner(solid(trimesh.creation.torus(400, 50)))
     scan = ring.scan(Camera(near_mm=100), look_at(ORIGIN, np.array([1.0, 0.0, 0.1])))
@@ -492,3 +586,19 @@ def test_an_open_surface_is_seen_from_both_sides() -> None:
     np.testing.assert_allclose(
         hits.normals, [[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]], atol=1e-12
     )
+
+
+def test_a_camera_sees_an_open_surface_from_both_sides() -> None:
+    """A roof of two faces wound against each other: the normals face the camera all the same."""
+    vertices = np.array([[-40.0, -30, 0], [40, -30, 0], [40, 30, 9], [-40, 30, 9]])
+    faces = np.array([[0, 1, 2], [0, 3, 2]])
+    roof = part_from_mesh(vertices, faces, name="roof", must_be_closed=False)
+    up = np.cross([80.0, 0, 0], [0.0, 60, 9])
+    up /= np.linalg.norm(up)
+    for pose, side in ((ABOVE, 1), (look_at(np.array([5.0, 3.0, -400.0]), ORIGIN), -1)):
+        scan = Scanner(roof).scan(Camera().scaled(0.25), pose)
+        assert set(scan.face) == {0, 1}
+        facing = np.tile(side * pose.rotate(up[None]), (len(scan.pixel), 1))
+        np.testing.assert_allclose(scan.normals, facing, atol=1e-7)  # f32
+        at_part = pose.inverse().apply(scan.points.astype(np.float64))
+        np.testing.assert_allclose((at_part - vertices[0]) @ up, 0, atol=ROUNDING_MM)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
@@ -27,16 +27,16 @@ from embreex.rtcore_scene import EmbreeScene
 from tqdm import tqdm
 
 from vanejax.camera import Camera, Viewpoints
+from vanejax.envelope import Envelope, Window
 from vanejax.errors import InputError
 from vanejax.part import Part
-from vanejax.rigid import RigidTransform
+from vanejax.pixel_rays import EDGE_ON_COSINE, MeasuredPixels, PixelRays
+from vanejax.rigid_transform import RigidTransform
 
 T = TypeVar("T")
 
-# Faces seen at more than 89.94 deg are not measured: a float32 ray may miss their edge by 1e-5 mm,
-# which along the ray would be 0.01 mm and more. No sensor measures them either.
-EDGE_ON_COSINE = 1e-3
-RAYS_PER_STRIP = 1 << 16  # float64 set-up of this many rays stays in the cache
+RAYS_PER_STRIP = 1 << 14  # what is computed of this many rays stays in the cache
+FACES_AT_ONCE = 1 << 14
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -61,9 +61,7 @@ class Scan:
     Attributes:
       points: [N, 3] f32, mm, camera frame.
       normals: [N, 3] f32, unit, camera frame, of the triangle hit, facing the camera.
-      range_mm: [N] f32, mm along the ray from the camera: the length of ``points``.
       face: [N] i32, index into the part's triangles.
-      incidence_deg: [N] f32, angle between the normal and the way back to the camera, 0 to 90.
       pixel: [N] i32, ``row * camera.width + column``, ascending.
       camera_from_part: the pose label; numpy f64 [3, 3] and [3], mm.
       hidden: [H, 3] f32, mm, camera frame: those of the area-uniform surface samples that the view
@@ -72,12 +70,24 @@ class Scan:
 
     points: np.ndarray
     normals: np.ndarray
-    range_mm: np.ndarray
     face: np.ndarray
-    incidence_deg: np.ndarray
     pixel: np.ndarray
     camera_from_part: RigidTransform
     hidden: np.ndarray | None = None
+
+    @functools.cached_property
+    def range_mm(self) -> np.ndarray:
+        """[N] f32, mm along the ray from the camera: the length of ``points``."""
+        return np.linalg.norm(self.points.astype(np.float64), axis=-1).astype(np.float32)
+
+    @functools.cached_property
+    def incidence_deg(self) -> np.ndarray:
+        """[N] f32, angle between the normal and the way back to the camera, 0 to 90."""
+        points, normals = self.points.astype(np.float64), self.normals.astype(np.float64)
+        # not by acos, which turns float32's rounding of a normal into 0.02 deg at 0 deg
+        sine = np.linalg.norm(np.cross(normals, points), axis=-1)
+        cosine = -np.einsum("ni,ni->n", normals, points)
+        return np.degrees(np.arctan2(sine, cosine)).astype(np.float32)
 
 
 class Scanner:
@@ -93,22 +103,27 @@ class Scanner:
         self.part = part
         self._surface_samples, self._seed = surface_samples, seed
         self._center = np.asarray(part.center, np.float64)
-        self._vertices = np.asarray(part.mesh.vertices, np.float64) - self._center
-        corners = self._vertices[np.asarray(part.mesh.faces)]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        length = np.linalg.norm(normals, axis=-1, keepdims=True)
-        # a triangle without area has no normal; zero makes it edge-on to every ray
-        self._normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
-        self._plane_mm = np.sum(self._normals * corners[:, 0], axis=-1)
-        self._radius = float(np.linalg.norm(self._vertices, axis=-1).max())
+        vertices = np.asarray(part.mesh.vertices, np.float64) - self._center
+        self._radius = float(np.linalg.norm(vertices, axis=-1).max())
+        self._envelope = Envelope.around(vertices)
+        self._planes = np.empty((len(part.mesh.faces), 4))
+        for faces, corners in self._triangles():
+            self._planes[faces] = _planes_of(corners)
         # robust: without it rays slip between two triangles that share an edge
         self._scene = EmbreeScene(robust=True)
         TriangleMesh(
             self._scene,
-            self._vertices.astype(np.float32),
+            vertices.astype(np.float32),
             np.ascontiguousarray(part.mesh.faces, np.int32),
         )
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def _triangles(self) -> Iterator[tuple[slice, np.ndarray]]:
+        """Faces and their corners [K, 3, 3] f64, mm, about the centre: not all at a time."""
+        vertices, faces = np.asarray(self.part.mesh.vertices), np.asarray(self.part.mesh.faces)
+        for first in range(0, len(faces), FACES_AT_ONCE):
+            some = slice(first, min(first + FACES_AT_ONCE, len(faces)))
+            yield some, vertices[faces[some]] - self._center
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """First intersections of any rays with the part, seen from outside.
@@ -151,9 +166,10 @@ class Scanner:
         face = self._scene.run(
             starts.reshape(-1, 3).astype(np.float32), directions.reshape(-1, 3).astype(np.float32)
         ).reshape(directions.shape[:-1])
-        normals = self._normals[face]
+        planes = self._planes.take(face, axis=0, mode="wrap")  # of any face where none is hit
+        normals = np.ascontiguousarray(planes[..., :3])
         closing = np.einsum("...i,...i->...", normals, directions)
-        gap = self._plane_mm[face] - np.einsum("...i,...i->...", normals, origins)
+        gap = planes[..., 3] - np.einsum("...i,...i->...", normals, origins)
         if not self.part.closed:  # the normal that faces the ray counts
             side = -np.sign(closing)
             normals *= side[..., None]
@@ -191,72 +207,61 @@ class Scanner:
         # "local" is the part's frame moved to the part's centre
         camera_from_local = RigidTransform(rotation, translation + rotation @ self._center)
         self._refuse_camera_inside(camera_from_local)
-        vertices = camera_from_local.apply(self._vertices)
-        strips = self._cast_pixels(camera, camera_from_local, vertices)
-        points, face, cosine, pixel = map(np.concatenate, zip(*strips, strict=True))
-        if not len(points):
-            raise InputError(_why_nothing_is_seen(camera, vertices))
-        normals = self._normals @ rotation.T
-        normals = normals.astype(np.float32)[face]
-        normals *= -np.sign(cosine)[:, None].astype(np.float32)
+        measured = self._measure(camera, camera_from_local)
+        if not len(measured.pixel):
+            depth_mm = -label.apply(np.asarray(self.part.mesh.vertices))[:, 2]
+            windows = self._windows(camera, camera_from_local)
+            raise InputError(_why_nothing_is_seen(camera, depth_mm, windows))
         return Scan(
-            points=points.astype(np.float32),
-            normals=normals,
-            range_mm=np.linalg.norm(points, axis=-1).astype(np.float32),
-            face=face,
-            incidence_deg=np.degrees(np.arccos(np.minimum(np.abs(cosine), 1))).astype(np.float32),
-            pixel=pixel,
+            points=measured.points,
+            normals=measured.normals,
+            face=measured.face,
+            pixel=measured.pixel,
             camera_from_part=label,
             hidden=self._hidden(camera, camera_from_local) if hidden else None,
         )
 
-    def _cast_pixels(
-        self, camera: Camera, camera_from_local: RigidTransform, vertices: np.ndarray
-    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """Strips of image rows: points [N, 3] f64, face, cosine of normal and ray, pixel.
-
-        The direction of a pixel's ray is (x, y, -1) in the camera frame and not made a unit
-        vector: Embree does not mind, and the ray's parameter is then the depth.
-        """
-        rotation = camera_from_local.rotation
-        eye = camera_from_local.inverse().translation
-        normals = self._normals @ rotation.T
-        plane = self._plane_mm + normals @ camera_from_local.translation
-        nearest = float(-vertices[:, 2].max())
-        start = max(camera.near_mm, nearest - 1.0)
-        columns, rows = _window(camera, vertices)
-        x, y = camera.slopes(columns, rows)
-        across = x[:, None] * rotation[0] - rotation[2]
-        down = y[:, None] * rotation[1]
-        step = max(1, RAYS_PER_STRIP // max(1, len(columns)))
-        strips = []
-        for first in range(0, max(1, len(rows)), step):
-            strip = slice(first, first + step)
-            directions = (down[strip, None] + across).reshape(-1, 3)
-            starts = eye + start * directions
-            face = self._scene.run(starts.astype(np.float32), directions.astype(np.float32))
+    def _measure(self, camera: Camera, camera_from_local: RigidTransform) -> MeasuredPixels:
+        """What the pixels see, strip by strip of the image."""
+        windows = self._windows(camera, camera_from_local)
+        rays = self._rays(camera, camera_from_local)
+        measured = MeasuredPixels(sum(window.size for window in windows))
+        # to turn every plane once is cheaper than one for each hit, unless they are more
+        once = len(self._planes) <= len(measured.pixel)
+        planes = rays.facing(self._planes) if once else self._planes
+        for window in windows:
+            face = self._scene.run(*rays.through(window))
             hit = np.flatnonzero(face >= 0)
             face = face[hit]
-            row, column = np.divmod(hit, max(1, len(columns)))
-            ray = np.stack([x[column], y[strip][row], np.full(len(hit), -1.0)], axis=-1)
-            closing = np.einsum("ni,ni->n", normals[face], ray)
-            cosine = closing / np.sqrt(np.einsum("ni,ni->n", ray, ray))
-            measured = np.abs(cosine) > EDGE_ON_COSINE
-            depth = np.divide(plane[face], closing, out=np.zeros_like(closing), where=measured)
-            keep = (depth >= camera.near_mm) & (depth <= camera.far_mm)
-            if nearest >= camera.near_mm and self.part.closed:
-                # not cut open, so a back face means a ray slipped in through a vertex, as in `cast`
-                keep &= closing < 0
-            pixel = rows[strip][row] * camera.width + columns[column]
-            strips.append(
-                (
-                    (depth[:, None] * ray)[keep],
-                    face[keep],
-                    cosine[keep],
-                    pixel[keep].astype(np.int32),
-                )
-            )
-        return strips
+            plane = planes.take(face, axis=0)
+            measured.add(rays, *window.pixels(hit), face, plane if once else rays.facing(plane))
+        measured.cut()
+        return measured
+
+    def _windows(self, camera: Camera, camera_from_local: RigidTransform) -> list[Window]:
+        """The strips of the image in which the part may be seen."""
+        return self._envelope.windows(camera, camera_from_local, pixels=RAYS_PER_STRIP)
+
+    def _rays(self, camera: Camera, camera_from_local: RigidTransform) -> PixelRays:
+        """The view's rays, from the near plane or just before the part, whichever is farther."""
+        corners = camera_from_local.apply(self._envelope.corners)
+        nearest = -corners[:, 2].max()
+        cut_open = nearest < camera.near_mm and self._nearest_mm(camera_from_local) < camera.near_mm
+        return PixelRays.of(
+            camera,
+            camera_from_local,
+            start_mm=max(camera.near_mm, nearest),
+            farthest_mm=np.linalg.norm(corners, axis=-1).max(),
+            # the back of a solid that is whole means that a ray slipped in through a vertex, as in
+            # `cast`
+            backs=cut_open or not self.part.closed,
+        )
+
+    def _nearest_mm(self, camera_from_local: RigidTransform) -> float:
+        """The depth of the part's nearest vertex."""
+        back = camera_from_local.rotation[2]
+        along = (np.asarray(self.part.mesh.vertices) - self._center) @ back
+        return float(-along.max() - camera_from_local.translation[2])
 
     @functools.cached_property
     def _surface(self) -> tuple[np.ndarray, np.ndarray]:
@@ -307,16 +312,20 @@ class Scanner:
         eye = camera_from_local.inverse().translation
         if np.linalg.norm(eye) > self._radius:
             return
-        corners = self._vertices[np.asarray(self.part.mesh.faces)]
-        middle = corners.mean(axis=1) - eye
-        area = np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
-        )
-        distance = np.maximum(np.linalg.norm(middle, axis=-1), 1e-6 * self._radius)
-        solid_angle = area * np.abs(np.sum(self._normals * middle, axis=-1)) / distance**3
-        direction = middle[[np.argmax(solid_angle)]]
-        face = self._scene.run(eye[None].astype(np.float32), direction.astype(np.float32))
-        if face[0] >= 0 and np.sum(self._normals[face[0]] * direction[0]) > 0:
+        largest, direction = 0.0, np.ones((1, 3))
+        for faces, corners in self._triangles():
+            middle = corners.mean(axis=1) - eye
+            area = np.linalg.norm(
+                np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+            )
+            distance = np.maximum(np.linalg.norm(middle, axis=-1), 1e-6 * self._radius)
+            towards = np.abs(np.einsum("ni,ni->n", self._planes[faces, :3], middle))
+            solid_angle = area * towards / distance**3
+            face = np.argmax(solid_angle)
+            if solid_angle[face] > largest:
+                largest, direction = solid_angle[face], middle[[face]]
+        face = self._scene.run(eye[None].astype(np.float32), direction.astype(np.float32))[0]
+        if face >= 0 and self._planes[face, :3] @ direction[0] > 0:
             raise InputError(
                 f"the camera at {np.round(eye + self._center, 3)} mm (part frame) is inside the "
                 f"part {self.part.name}; move it at least camera.near_mm away"
@@ -335,7 +344,7 @@ def scan_views(
 ) -> list[T]:
     """Scans a part from every viewpoint, on all cores.
 
-    A view of 200,000 points takes 8 MB, so 216 of them do not belong in memory: ``transform`` is
+    A view of 200,000 points takes 6 MB, so 216 of them do not belong in memory: ``transform`` is
     applied to each scan in the thread that made it, and only its result is kept.
 
     Args:
@@ -373,26 +382,19 @@ def scan_views(
         return list(bar)
 
 
-def _window(camera: Camera, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows, i64, of the smallest image rectangle that contains the projected part.
-
-    Its margin of one pixel is for rays that float32 turns by some 1e-5 of a pixel. A part that
-    reaches behind the camera has no bounded projection: every pixel.
-    """
-    size = np.array([camera.width, camera.height])
-    first, last = np.zeros(2), size - 1.0
-    if (vertices[:, 2] < 0).all():
-        pixels = camera.project(vertices)
-        first = np.clip(np.floor(pixels.min(axis=0)) - 1, 0, size)
-        last = np.clip(np.floor(pixels.max(axis=0)) + 1, -1, size - 1)
-    columns, rows = (np.arange(int(a), int(b) + 1) for a, b in zip(first, last, strict=True))
-    return columns, rows
+def _planes_of(corners: np.ndarray) -> np.ndarray:
+    """Planes [K, 4] f64 of triangles [K, 3, 3]: outward unit normal and distance, mm."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    # a triangle without area has no normal; zero makes it edge-on to every ray
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    return np.column_stack([normals, np.einsum("ni,ni->n", normals, a)])
 
 
-def _why_nothing_is_seen(camera: Camera, vertices: np.ndarray) -> str:
-    """The message for a view without a point, from the part's vertices [V, 3] in camera frame."""
-    depth = -vertices[:, 2]
-    nearest, farthest = depth.min(), depth.max()
+def _why_nothing_is_seen(camera: Camera, depth_mm: np.ndarray, windows: list[Window]) -> str:
+    """The message for a view without a point, from the depths [V] of the part's vertices."""
+    nearest, farthest = depth_mm.min(), depth_mm.max()
     where = f"the part lies {nearest:.1f} to {farthest:.1f} mm in front of the camera"
     if farthest <= 0:
         return "the part is behind the camera; check the sign of the pose (+z is to the camera)"
@@ -400,8 +402,7 @@ def _why_nothing_is_seen(camera: Camera, vertices: np.ndarray) -> str:
         return f"{where}, before its near plane at {camera.near_mm:g} mm; move the camera away"
     if nearest > camera.far_mm:
         return f"{where}, beyond its far plane at {camera.far_mm:g} mm; move the camera closer"
-    columns, rows = _window(camera, vertices)
-    if not len(columns) or not len(rows):
+    if not windows:
         return f"{where}, outside its field of view; point the camera at the part's center"
     return (
         f"{where}, but no pixel's ray meets it between the clip planes at {camera.near_mm:g} and "
