@@ -35,7 +35,7 @@ from vanejax.rigid_transform import RigidTransform
 
 T = TypeVar("T")
 
-RAYS_PER_STRIP = 1 << 14  # what is computed of this many rays stays in the cache
+RAYS_PER_STRIP = 24 * 1024  # what is computed of this many rays stays in the cache
 FACES_AT_ONCE = 1 << 14
 
 
@@ -232,7 +232,7 @@ class Scanner:
         for window in windows:
             face = self._scene.run(*rays.through(window))
             hit = np.flatnonzero(face >= 0)
-            face = face[hit]
+            face = face.take(hit)
             plane = planes.take(face, axis=0)
             measured.add(rays, *window.pixels(hit), face, plane if once else rays.facing(plane))
         measured.cut()
