@@ -512,6 +512,8 @@ def test_importing_the_package_loads_nothing_heavy(tmp_path) -> None:
     [
         ["inspect", "scan.ply"],
         ["inspect", "wedge.stl"],
+        ["register", "scan.ply", "wedge.stl", "--quiet"],
+        ["scan", "wedge.stl", "--out", "scans", "--views", "40,", "--quiet"],
     ],
     ids=" ".join,
 )
