@@ -105,6 +105,7 @@ def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
         batch_size=settings.batch_size,
         seed=config.seed,
         average_decay=settings.average_decay,
+        quick_compilation=settings.quick_compilation,
     )
     validate = make_validation(config, bank, drawing, scans.radius_mm)
     state = init_state(model, optimizer, bank, drawing, seed=config.seed)

@@ -87,4 +87,5 @@ class VanePairs:
             batch_size=self.batch,
             seed=0,
             average_decay=self.config.training.average_decay,
+            quick_compilation=self.config.training.quick_compilation,
         )

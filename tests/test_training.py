@@ -11,7 +11,7 @@ import numpy as np
 import optax
 import pytest
 
-from vanejax import losses
+from vanejax import losses, training
 from vanejax.models.rpmnet import Match
 from vanejax.pairs import Drawing, Pair, ScanBank
 from vanejax.pointcloud import PointCloud
@@ -311,3 +311,22 @@ def test_the_loss_discounts_early_iterations_and_shares_the_reference():
         last.append(float(parts[0]) / 2.0)
     np.testing.assert_allclose(found, np.mean(totals), rtol=1e-5)  # f32 eps x 50
     np.testing.assert_allclose(metrics["pose"], np.mean(last), rtol=1e-5)
+
+
+def test_quick_compilation_changes_rounding_only(monkeypatch):
+    """And is left alone where XLA knows no such option."""
+    arguments = (MODEL, OPTIMIZER, LOSS, DRAWING)
+    settings = {"batch_size": 2, "seed": 7, "average_decay": DECAY}
+    expected, metrics = step(start(), bank())
+    for known in (True, False):
+        if not known:
+            monkeypatch.setattr(training, "_knows", lambda options: False)
+        quick = make_train_step(*arguments, **settings, quick_compilation=True)
+        found, same = quick(start(), bank())
+        for a, b in zip(
+            jax.tree.leaves((found, same)), jax.tree.leaves((expected, metrics)), strict=True
+        ):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)  # f32 eps x 100
+    monkeypatch.undo()
+    assert not training._knows({"xla_there_is_no_such_option": True})
+    assert training._knows({})
