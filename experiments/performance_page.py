@@ -2,8 +2,8 @@
 
 python -m experiments.performance_page
 
-Run it after copying a run's benchmark.json to experiments/results; a test checks that the page is
-current.
+Run it after copying a run's benchmark.json to experiments/results, and that of a run with ``--only
+scaling --large`` as growth.json; a test checks that the page is current.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from vanejax.whole_file import write_text
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "performance.md"
-RESULTS = ROOT / "experiments" / "results" / "benchmark.json"
+RESULTS = ROOT / "experiments" / "results"
+NAMES = "benchmark", "growth"
 BEGIN, END = "<!-- figures -->", "<!-- end of figures -->"
 
 
-def figures(report: Mapping[str, Any]) -> str:
-    """The benchmark as two Markdown tables, with the machine and the date above them."""
+def figures(report: Mapping[str, Any], growth: Mapping[str, Any]) -> str:
+    """The two benchmarks as Markdown tables, with the machine and the date above them."""
     machine = report["machine"]
     lines = [
         f"{machine['cpu']}, {machine['cores']} cores, "
@@ -42,8 +43,9 @@ def figures(report: Mapping[str, Any]) -> str:
         goal = "" if row["goal_s"] is None else f"{row['goal_s']:g} s: {row['met']}"
         beside = "; ".join(_beside(entry) for entry in row["against"])
         lines.append(f"| {row['name']} | {median} | {least} to {most} | {goal} | {beside} |")
+    lines += ["", f"Growth: {growth['date'][:10]}, commit {growth['commit'][:10]}."]
     lines += ["", "| how it grows | sizes | median (s) | exponent |", "|---|---|---|---|"]
-    for row in report["growth"]:
+    for row in growth["growth"]:
         sizes = ", ".join(f"{point['size']:,.0f}" for point in row["points"])
         medians = ", ".join(shown(point["seconds"]["median"]) for point in row["points"])
         power = "" if row["exponent"] is None else f"{row['exponent']:.2f}"
@@ -62,16 +64,22 @@ def _beside(entry: Mapping[str, Any]) -> str:
     return f"{words} ({'at least' if peer else 'at most'} {entry['goal']:g}: {entry['met']})"
 
 
-def page(text: str, report: Mapping[str, Any]) -> str:
+def page(text: str, report: Mapping[str, Any], growth: Mapping[str, Any]) -> str:
     """The page with its figures replaced."""
     before, _, rest = text.partition(BEGIN)
     _, _, after = rest.partition(END)
-    return f"{before}{BEGIN}\n{figures(report)}\n{END}{after}"
+    return f"{before}{BEGIN}\n{figures(report, growth)}\n{END}{after}"
+
+
+def recorded() -> tuple[dict[str, Any], dict[str, Any]]:
+    """The benchmark and the growth of costs under experiments/results."""
+    one, two = (json.loads((RESULTS / f"{name}.json").read_text()) for name in NAMES)
+    return one, two
 
 
 def main() -> None:
     """Rewrites the page."""
-    write_text(PAGE, page(PAGE.read_text(), json.loads(RESULTS.read_text())))
+    write_text(PAGE, page(PAGE.read_text(), *recorded()))
 
 
 if __name__ == "__main__":

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
-
 from experiments import performance_page
-from experiments.performance_page import PAGE, RESULTS, figures, page
+from experiments.performance_page import PAGE, figures, page, recorded
 
 REPORT = {
     "date": "2026-01-02T03:04:05+00:00",
@@ -59,7 +57,7 @@ REPORT = {
 
 
 def test_figures_stand_beside_peer_limit_and_goal():
-    lines = figures(REPORT).splitlines()
+    lines = figures(REPORT, REPORT).splitlines()
     assert lines[0] == (
         "A processor, 2 cores, 204 GFLOP/s in a large f32 product; 2026-01-02, commit 0123456789, "
         "medians of at least 5 repeats."
@@ -75,11 +73,11 @@ def test_figures_stand_beside_peer_limit_and_goal():
 
 def test_only_what_is_between_the_marks_is_replaced():
     text = "before\n<!-- figures -->\nold\n<!-- end of figures -->\nafter\n"
-    found = page(text, REPORT)
+    found = page(text, REPORT, REPORT)
     assert found.startswith("before\n<!-- figures -->\nA processor")
     assert found.endswith("|\n<!-- end of figures -->\nafter\n")
     assert "old" not in found
-    assert page(found, REPORT) == found
+    assert page(found, REPORT, REPORT) == found
 
 
 def test_the_command_rewrites_the_page(tmp_path, monkeypatch):
@@ -91,4 +89,4 @@ def test_the_command_rewrites_the_page(tmp_path, monkeypatch):
 
 
 def test_the_page_is_current():
-    assert page(PAGE.read_text(), json.loads(RESULTS.read_text())) == PAGE.read_text()
+    assert page(PAGE.read_text(), *recorded()) == PAGE.read_text()
