@@ -3,7 +3,7 @@
 python -m experiments.performance_page
 
 Run it after copying a run's benchmark.json to experiments/results, and that of a run with ``--only
-scaling --large`` as growth.json; a test checks that the page is current.
+scaling`` as growth.json; a test checks that the page is current.
 """
 
 from __future__ import annotations
