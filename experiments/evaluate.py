@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import functools
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +24,19 @@ from experiments import command_line, pictures
 from experiments.experiment import Experiment
 from experiments.registrations import Results, register_views
 from experiments.report import hardest_views, plain, summarize, table
-from experiments.run_folder import RunFolder, git_commit, read_log, versions, write_json
+from experiments.run_folder import (
+    RunFolder,
+    git_commit,
+    training_record,
+    versions,
+    write_json,
+)
+from experiments.training_record import TrainingRecord
 from vanejax.checkpoint import Checkpoints
 from vanejax.dataset import ScanSet, describe_source, load_scan_set
 from vanejax.errors import InputError
-from vanejax.models.rpmnet import RpmNet, rpmnet
 from vanejax.pairs import make_bank
 from vanejax.part import Part
-from vanejax.registration import Register, Registration
 from vanejax.training import Variables, init_state
 
 
@@ -44,10 +47,10 @@ def evaluate(
     folder: Path,
     *,
     part: Part | None = None,
-    log: Sequence[Mapping[str, float]] = (),
+    training: TrainingRecord | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Registers the test views with RPM-Net, from the identity, and reports.
+    """Registers the test views with the network, from the identity, and reports.
 
     Args:
       config: the network, how pairs are drawn, and the seed.
@@ -55,7 +58,7 @@ def evaluate(
       variables: trained weights.
       folder: receives evaluation.json and pictures.
       part: where given, pictures that need the CAD part are drawn too.
-      log: rows of the training log; where given, the training curves are drawn too.
+      training: where given, the report says how long it took, and its curves are drawn.
       progress: whether to show a progress bar.
 
     Returns:
@@ -67,6 +70,9 @@ def evaluate(
     test = scans.test
     results = registered(config, scans, variables, progress=progress)
     report = report_of(config, scans, results)
+    log = training.rows if training is not None else ()
+    if training is not None:
+        report["training"] = plain(training.summary(config.training.steps))
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "evaluation.json", report)
     pictures.draw(results, test, hardest_views(test), log, folder)
@@ -88,7 +94,7 @@ def registered(
     if not len(test):
         raise InputError("no test views: none of config.views.azimuths_deg is a multiple of 40 deg")
     return register_views(
-        make_register(config, variables),
+        config.make_network().register(variables),
         make_bank(test, num_reference=config.data.num_reference),
         config.make_drawing(scans),
         seed=config.seed,
@@ -99,8 +105,10 @@ def registered(
 
 def report_of(config: Experiment, scans: ScanSet, results: Results) -> dict[str, Any]:
     """What evaluation.json holds of the registrations of the test views."""
+    network = config.make_network()
+    times = "1 iteration" if network.iterations == 1 else f"{network.iterations} iterations"
     report = {
-        "method": f"RPM-Net, {config.model.test_iterations} iterations, no initial guess",
+        "method": f"{network.title}, {times}, no initial guess",
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "device": str(jax.devices()[0].device_kind),
         "commit": git_commit(),
@@ -112,17 +120,6 @@ def report_of(config: Experiment, scans: ScanSet, results: Results) -> dict[str,
     return plain(report | summarize(results, scans.test))
 
 
-def make_register(config: Experiment, variables: Variables) -> Register:
-    """RPM-Net as configured for tests, jitted once for all views."""
-    return functools.partial(_run, config.make_model(), config.model.test_iterations, variables)
-
-
-# variables are an argument: as constants of the program they would be folded at compile time
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _run(model: RpmNet, iterations: int, variables: Variables, *pair_and_key: Any) -> Registration:
-    return rpmnet(model, variables, iterations=iterations)(*pair_and_key)
-
-
 def load_variables(
     config: Experiment, scans: ScanSet, folder: Path, *, which: str = "latest"
 ) -> Variables:
@@ -131,7 +128,7 @@ def load_variables(
     Raises:
       InputError: no checkpoint there, or one of another model.
     """
-    model, drawing = config.make_model(), config.make_drawing(scans)
+    model, drawing = config.make_network().model, config.make_drawing(scans)
     bank = make_bank(scans, num_reference=config.data.num_reference)
     like = jax.eval_shape(
         lambda: init_state(model, config.make_optimizer(), bank, drawing, seed=config.seed)
@@ -152,7 +149,7 @@ def main(config: Experiment, workdir: Path, out: Path, which: str) -> None:
     expected = describe_source(part, camera, viewpoints, config.data.voxel_mm)
     scans = load_scan_set(workdir / "scans.npz", expected=expected)
     variables = load_variables(config, scans, workdir, which=which)
-    evaluate(config, scans, variables, out, part=part, log=read_log(workdir))
+    evaluate(config, scans, variables, out, part=part, training=training_record(workdir))
 
 
 if __name__ == "__main__":

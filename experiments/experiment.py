@@ -5,18 +5,20 @@ Every field can be overridden on the command line: ``--config.model.num_neighbor
 
 # No ``from __future__ import annotations`` here: the command line reads the fields' types.
 import dataclasses
+import difflib
+from collections.abc import Callable
 from dataclasses import field
 
 import numpy as np
 import optax
 
+from experiments.networks import LossSettings, ModelSettings, Network, rpmnet_network
 from vanejax.camera import Camera, Viewpoints, hemisphere_viewpoints
 from vanejax.dataset import ScanSet
 from vanejax.errors import InputError
-from vanejax.models.rpmnet import RpmNet
-from vanejax.pairs import Drawing, source_sizes
+from vanejax.pairs import Bank, Drawing, make_bank, source_sizes
 from vanejax.part import Part, load_part
-from vanejax.training import RpmNetLoss, make_optimizer
+from vanejax.training import make_optimizer
 from vanejax.vane import guide_vane
 
 
@@ -62,6 +64,8 @@ class DataSettings:
       noise_clip: largest noise per coordinate, unit-sphere units.
       max_rotation_deg: largest angle of the random pose.
       max_translation: largest coordinate of its translation, unit-sphere units.
+      shapes: what the network is trained on: empty for the scans of the part; else generic shapes,
+        see `experiments.shape_sets.load_shapes`. Tests are the part's scans either way.
     """
 
     voxel_mm: float = 1.5
@@ -70,39 +74,7 @@ class DataSettings:
     noise_clip: float = 0.05
     max_rotation_deg: float = 45.0
     max_translation: float = 0.5
-
-
-@dataclasses.dataclass
-class ModelSettings:
-    """RPM-Net.
-
-    Attributes:
-      num_neighbors: the paper's k.
-      radius: of a neighbourhood, unit-sphere units.
-      sinkhorn_iterations: rounds of normalisation.
-      feature_width: channels of a feature.
-      test_iterations: of the network at inference.
-    """
-
-    num_neighbors: int = 32
-    radius: float = 0.3
-    sinkhorn_iterations: int = 5
-    feature_width: int = 96
-    test_iterations: int = 5
-
-
-@dataclasses.dataclass
-class LossSettings:
-    """Factors of the parts of the loss; see `vanejax.training.RpmNetLoss`."""
-
-    iterations: int = 2
-    discount: float = 0.5
-    pose: float = 1.0
-    inlier: float = 0.01
-    matching: float = 0.0
-    matching_sigma: float = 0.04
-    partner: float = 0.0
-    pairs_at_once: int = 1
+    shapes: str = ""
 
 
 @dataclasses.dataclass
@@ -121,6 +93,8 @@ class TrainingSettings:
       keep: checkpoints kept besides the best.
       quick_compilation: a quarter less time to compile the step on a CPU, and each step 5 %
         slower; off is better from some hundred steps on.
+      budget_minutes: training ends here at the latest, with what it has; 0 for no limit. It counts
+        the time over all resumptions, and makes the result depend on the machine.
       validation_pairs: drawn from the training views with a key of their own; they choose the
         best checkpoint, so that the test views stay unseen.
     """
@@ -137,6 +111,7 @@ class TrainingSettings:
     save_every: int = 250
     keep: int = 2
     quick_compilation: bool = True
+    budget_minutes: float = 0.0
     validation_pairs: int = 18
 
 
@@ -189,18 +164,29 @@ class Experiment:
             max_translation=self.data.max_translation,
         )
 
-    def make_model(self) -> RpmNet:
-        """The network, without parameters."""
-        return RpmNet(
-            num_neighbors=self.model.num_neighbors,
-            radius=self.model.radius,
-            sinkhorn_iterations=self.model.sinkhorn_iterations,
-            feature_width=self.model.feature_width,
-        )
+    def make_network(self) -> Network:
+        """The network to train, by ``model.name``.
 
-    def make_loss(self) -> RpmNetLoss:
-        """The loss of training."""
-        return RpmNetLoss(**dataclasses.asdict(self.loss))
+        Raises:
+          InputError: there is no network of this name.
+        """
+        makers: dict[str, Callable[[], Network]] = {
+            "rpmnet": lambda: rpmnet_network(self.model, self.loss),
+        }
+        if self.model.name not in makers:
+            near = difflib.get_close_matches(self.model.name, makers, 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise InputError(
+                f"config.model.name={self.model.name!r}: there is no such network{hint} "
+                f"(the names are {', '.join(makers)})"
+            )
+        return makers[self.model.name]()
+
+    def make_bank(self, scans: ScanSet) -> Bank:
+        """What training pairs are drawn from: the training views, or generic shapes."""
+        if not self.data.shapes:
+            return make_bank(scans.train, num_reference=self.data.num_reference)
+        raise NotImplementedError
 
     def make_optimizer(self) -> optax.GradientTransformation:
         """Adam with its schedule."""
@@ -230,7 +216,7 @@ class Experiment:
         not_negative = {
             "data": ("noise", "max_rotation_deg", "max_translation"),
             "loss": ("discount", "pose", "inlier", "matching", "partner"),
-            "training": ("warmup_steps", "final_fraction"),
+            "training": ("warmup_steps", "final_fraction", "budget_minutes"),
         }
         for groups, least, words in ((positive, False, "positive"), (not_negative, True, ">= 0")):
             for group, names in groups.items():
@@ -238,6 +224,7 @@ class Experiment:
                     value = getattr(getattr(self, group), name)
                     if not (np.isfinite(value) and (value >= 0 if least else value > 0)):
                         raise InputError(f"config.{group}.{name}={value!r} must be {words}")
+        self.make_network()
         if self.model.feature_width % 8:
             raise InputError(
                 f"config.model.feature_width={self.model.feature_width} must be a multiple of 8, "

@@ -15,10 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from experiments.experiment import Experiment
+from experiments.training_record import TrainingRecord
 from vanejax.errors import InputError
 from vanejax.part import Part
 
 PACKAGES = ("vanejax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "embreex")
+CLOCK = "clock.json"
 
 
 class RunFolder:
@@ -89,6 +91,15 @@ class RunFolder:
         }
         write_json(record, mine | environment)
 
+    @property
+    def seconds(self) -> float:
+        """Time spent on training up to the last checkpoint, over all resumptions."""
+        return _read_seconds(self.path)
+
+    @seconds.setter
+    def seconds(self, value: float) -> None:
+        write_json(self.path / CLOCK, {"seconds": value})
+
     def open_log(self, step: int) -> None:
         """Readies the log for the rows after ``step``: what a killed run wrote beyond it goes."""
         from tensorboardX import SummaryWriter  # takes a second to import
@@ -118,6 +129,16 @@ def read_log(folder: str | os.PathLike[str]) -> list[dict[str, float]]:
         if isinstance(row, dict) and isinstance(row.get("step"), int):
             rows.append(row)
     return rows
+
+
+def training_record(folder: str | os.PathLike[str]) -> TrainingRecord:
+    """What the folder of a run knows of its training."""
+    return TrainingRecord(rows=read_log(folder), seconds=_read_seconds(Path(folder)))
+
+
+def _read_seconds(folder: Path) -> float:
+    clock = folder / CLOCK
+    return float(read_json(clock)["seconds"]) if clock.exists() else 0.0
 
 
 def read_json(path: Path) -> Any:

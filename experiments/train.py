@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,14 +24,13 @@ from tqdm import tqdm
 
 from experiments import command_line
 from experiments.evaluate import evaluate
-from experiments.experiment import Experiment
-from experiments.run_folder import RunFolder, read_log
+from experiments.experiment import Experiment, TrainingSettings
+from experiments.run_folder import RunFolder, training_record
 from vanejax.checkpoint import Checkpoints, all_finite, restore_or
 from vanejax.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
-from vanejax.models.rpmnet import last_match
-from vanejax.pairs import Drawing, ScanBank, draw_pairs, make_bank
+from vanejax.metrics import pose_metrics
+from vanejax.pairs import Bank, Drawing
 from vanejax.part import Part
-from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.training import (
     Metrics,
@@ -38,7 +38,6 @@ from vanejax.training import (
     Variables,
     init_state,
     make_train_step,
-    pose_metrics,
 )
 
 DIVERGED = 20.0  # times the loss of the first rows: no run of use comes back from there
@@ -76,7 +75,9 @@ def train(config: Experiment, workdir: Path) -> None:
         folder.claim(config, part)
         scans = load_or_scan(config, part, folder.path / "scans.npz")
         state = fit(config, scans, folder)
-        evaluate(config, scans, state.average, workdir, part=part, log=read_log(workdir))
+        evaluate(
+            config, scans, state.average, workdir, part=part, training=training_record(workdir)
+        )
 
 
 def load_or_scan(config: Experiment, part: Part, path: Path) -> ScanSet:
@@ -94,13 +95,12 @@ def load_or_scan(config: Experiment, part: Part, path: Path) -> ScanSet:
 def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
     """Trains on the training views of ``scans``; the test views are not looked at."""
     settings = config.training
-    model, optimizer = config.make_model(), config.make_optimizer()
-    drawing = config.make_drawing(scans)
-    bank = make_bank(scans.train, num_reference=config.data.num_reference)
+    network, optimizer = config.make_network(), config.make_optimizer()
+    drawing, bank = config.make_drawing(scans), config.make_bank(scans)
     step = make_train_step(
-        model,
+        network.model,
         optimizer,
-        config.make_loss(),
+        network.loss,
         drawing,
         batch_size=settings.batch_size,
         seed=config.seed,
@@ -108,7 +108,7 @@ def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
         quick_compilation=settings.quick_compilation,
     )
     validate = make_validation(config, bank, drawing, scans.radius_mm)
-    state = init_state(model, optimizer, bank, drawing, seed=config.seed)
+    state = init_state(network.model, optimizer, bank, drawing, seed=config.seed)
     state = restore_or(folder.checkpoints, state, keep=settings.keep)
 
     with (
@@ -116,22 +116,33 @@ def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
         Log(folder, int(state.step), settings.steps, scans.radius_mm) as log,
         stop_signal() as stop,
     ):
+        began = time.monotonic() - folder.seconds
+        over = over_budget(settings, folder.seconds)
         for done in range(int(state.step) + 1, settings.steps + 1):
+            if over:
+                break
             state, metrics = step(state, bank)
             log.add(metrics)
             leave = bool(stop)  # once: a signal may come between two looks
-            finish = leave or done == settings.steps
+            over = over_budget(settings, time.monotonic() - began)
+            last = over or done == settings.steps
             score = None
-            if done % settings.log_every == 0 or finish:
+            if done % settings.log_every == 0 or last or leave:
                 log.write(done)
-            if done % settings.evaluate_every == 0 or done == settings.steps:
+            if done % settings.evaluate_every == 0 or last:
                 score = log.write_validation(done, validate(state))
-            if done % settings.save_every == 0 or score is not None or finish:
+            if done % settings.save_every == 0 or score is not None or leave:
                 log.check_weights(done, state)
                 checkpoints.save(state, score=score)
-            if leave and done < settings.steps:
+                folder.seconds = time.monotonic() - began
+            if leave and not last:
                 raise Interrupted(stop[0], done)
     return state
+
+
+def over_budget(settings: TrainingSettings, seconds: float) -> bool:
+    """Whether training has used up its budget."""
+    return 0 < 60 * settings.budget_minutes <= seconds
 
 
 class Log:
@@ -200,35 +211,31 @@ class Log:
 
 
 def make_validation(
-    config: Experiment, bank: ScanBank, drawing: Drawing, radius_mm: float
+    config: Experiment, bank: Bank, drawing: Drawing, radius_mm: float
 ) -> Callable[[TrainState], dict[str, float]]:
-    """Pose errors of the averaged weights on training views, drawn with a key of their own.
+    """Pose errors of the averaged weights on training entries, drawn with a key of their own.
 
     They choose the best checkpoint, so that the test views stay unseen until the end.
     """
-    model, settings = config.make_model(), config.training
+    network, count = config.make_network(), config.training.validation_pairs
     key = jax.random.fold_in(jax.random.key(config.seed), 0x7A11DA7E)
-    views = jnp.linspace(0, bank.scans.mask.shape[0] - 1, settings.validation_pairs).astype(int)
+    entries = jnp.linspace(0, bank.size - 1, count).astype(int)
 
     @jax.jit
-    def errors(variables: Variables, bank: ScanBank) -> Metrics:
-        pairs = draw_pairs(key, bank, views, drawing)
-        features = model.apply(variables, pairs.target, method="features")
+    def errors(variables: Variables, bank: Bank) -> Metrics:
+        register = network.factory(network.model, variables, iterations=network.iterations)
 
-        def one(pair: tuple[PointCloud, RigidTransform]) -> Metrics:
-            source, truth = pair
-            match = last_match(
-                model,
-                variables,
-                source,
-                pairs.target,
-                RigidTransform.identity(),
-                iterations=config.model.test_iterations,
-                target_features=features,
+        def one(number: jax.Array) -> Metrics:
+            draw_key, register_key = jax.random.split(jax.random.fold_in(key, number))
+            pairs = bank.draw(draw_key, entries[number][None], drawing)
+            source, truth = jax.tree.map(
+                lambda leaf: leaf[0], (pairs.source, pairs.target_from_source)
             )
-            return pose_metrics(match.target_from_source, truth)
+            init = jax.tree.map(jnp.asarray, RigidTransform.identity())
+            found = register(source, pairs.target, init, register_key)
+            return pose_metrics(found.target_from_source, truth)
 
-        return jax.lax.map(one, (pairs.source, pairs.target_from_source))
+        return jax.lax.map(one, jnp.arange(count))
 
     def validate(state: TrainState) -> dict[str, float]:
         found = jax.device_get(errors(state.average, bank))

@@ -74,15 +74,15 @@ class VanePairs:
 
     def state(self) -> TrainState:
         """Untrained."""
-        model, optimizer = self.config.make_model(), self.config.make_optimizer()
+        model, optimizer = self.config.make_network().model, self.config.make_optimizer()
         return init_state(model, optimizer, self.bank, self.drawing, seed=0)
 
     def train_step(self):
         """The jitted step of training: ``state, metrics = step(state, bank)``."""
         return make_train_step(
-            self.config.make_model(),
+            self.config.make_network().model,
             self.config.make_optimizer(),
-            self.config.make_loss(),
+            self.config.make_network().loss,
             self.drawing,
             batch_size=self.batch,
             seed=0,

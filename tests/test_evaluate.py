@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from experiments.configs.smoke import get_config
-from experiments.evaluate import evaluate, make_register
+from experiments.evaluate import evaluate
 from experiments.experiment import Experiment
 from experiments.registrations import Results, register_views
 from experiments.report import hardest_views, plain, summarize, table
+from experiments.training_record import TrainingRecord
 from vanejax.dataset import ScanSet, make_scan_set
 from vanejax.errors import InputError
 from vanejax.pairs import ScanBank, draw_source, make_bank
@@ -151,7 +152,7 @@ def test_a_method_that_always_fails_has_no_figures(
 def test_evaluate_writes_json_and_pictures(
     config: Experiment, scans: ScanSet, bank: ScanBank, tmp_path: Path, capsys
 ) -> None:
-    model, drawing = config.make_model(), config.make_drawing(scans)
+    model, drawing = config.make_network().model, config.make_drawing(scans)
     key = jax.random.key(0)
     source, _ = draw_source(key, bank, jnp.asarray(0), drawing)
     variables = jax.jit(model.init, static_argnums=4)(
@@ -159,7 +160,15 @@ def test_evaluate_writes_json_and_pictures(
     )
     rows = [{"step": step, "loss": 1 / step, "rotation_error_deg": 2.0} for step in (1, 2, 3)]
     part = config.make_part()
-    report = evaluate(config, scans, variables, tmp_path, part=part, log=rows, progress=False)
+    report = evaluate(
+        config,
+        scans,
+        variables,
+        tmp_path,
+        part=part,
+        training=TrainingRecord(rows, 36.0),
+        progress=False,
+    )
 
     def refuse(constant: str) -> float:
         raise ValueError(constant)
@@ -179,7 +188,7 @@ def test_evaluate_writes_json_and_pictures(
     printed = capsys.readouterr().out
     assert "rotation error (deg)" in printed
     # the same weights and seed give the same figures
-    found = register(make_register(config, variables), config, scans, bank)
+    found = register(config.make_network().register(variables), config, scans, bank)
     again = [row["rotation_error_deg"] for row in report["rows"]]
     np.testing.assert_array_equal(found.errors.rotation_deg, np.float32(again))
 

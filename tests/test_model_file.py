@@ -72,7 +72,7 @@ def workdir(config: Experiment, part: Part, scans: ScanSet, tmp_path_factory) ->
         rng = np.random.default_rng(0)
         variables = jax.tree.map(
             lambda leaf: jnp.asarray(0.1 * rng.normal(size=leaf.shape), leaf.dtype),
-            abstract_variables(config.make_model()),
+            abstract_variables(config.make_network().model),
         )
         state = TrainState(
             step=jnp.asarray(0, jnp.int32),
@@ -112,7 +112,7 @@ def assert_same_weights(found: Any, wanted: Any) -> None:
 def test_an_export_holds_the_run(
     matcher: TrainedMatcher, config: Experiment, scans: ScanSet, part: Part, workdir: Path
 ) -> None:
-    assert matcher.model == config.make_model()
+    assert matcher.model == config.make_network().model
     assert matcher.drawing == config.make_drawing(scans)
     assert matcher.iterations == config.model.test_iterations
     assert matcher.voxel_mm == config.data.voxel_mm
@@ -163,7 +163,7 @@ def test_what_is_loaded_computes_what_the_run_does(
 
     variables = load_variables(config, scans, workdir, which="best")
     found = features(matcher.model, matcher.variables)
-    np.testing.assert_array_equal(found, features(config.make_model(), variables))
+    np.testing.assert_array_equal(found, features(config.make_network().model, variables))
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-5)  # f32
 
 

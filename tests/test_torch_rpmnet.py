@@ -14,8 +14,8 @@ from vanejax.models.rpmnet import RpmNet, variables_from_torch
 from vanejax.pairs import Pair
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform, exp_so3
+from vanejax.rpmnet_loss import RpmNetLoss
 from vanejax.torch_weights import load_state_dict
-from vanejax.training import RpmNetLoss
 
 torch = pytest.importorskip("torch")
 

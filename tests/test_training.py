@@ -12,18 +12,13 @@ import optax
 import pytest
 
 from vanejax import losses, training
+from vanejax.metrics import pose_metrics
 from vanejax.models.rpmnet import Match
 from vanejax.pairs import Drawing, Pair, ScanBank
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform, exp_se3, log_se3
-from vanejax.training import (
-    RpmNetLoss,
-    init_state,
-    make_optimizer,
-    make_train_step,
-    pose_metrics,
-    views_of_step,
-)
+from vanejax.rpmnet_loss import RpmNetLoss
+from vanejax.training import init_state, make_optimizer, make_train_step, views_of_step
 
 
 class Twist(nn.Module):

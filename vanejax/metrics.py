@@ -94,6 +94,14 @@ def pose_errors(found: RigidTransform, truth: RigidTransform, *, unit_mm: float)
     )
 
 
+def pose_metrics(found: RigidTransform, truth: RigidTransform) -> dict[str, jax.Array]:
+    """Rotation error in degrees and translation error in unit-sphere units, [...] each."""
+    return {
+        "rotation_error_deg": rotation_error_deg(found, truth),
+        "translation_error": translation_error(found, truth),
+    }
+
+
 def mean_per_axis(axis_errors: jax.Array) -> jax.Array:
     """MRE_k (eq. 8) or MTE_k (eq. 9), k = x, y, z: ``sum_i e_i^(k) / N`` over N views.
 

@@ -56,6 +56,11 @@ def export_workdir(
         config = run["config"]
         settings = dict(config["model"])
         iterations = settings.pop("test_iterations")
+        name = settings.pop("name", "rpmnet")  # runs of older versions are all RPM-Net's
+        if name != "rpmnet":
+            raise InputError(
+                f"{workdir} is a run of {name!r}: register takes the weights of an RPM-Net"
+            )
         model = model_from_dict(settings, str(record))
         drawing = _drawing(config["data"], scans)
         voxel_mm = config["data"]["voxel_mm"]

@@ -7,6 +7,7 @@ is JAX code driven by a key, so that the same key gives the same pair on any mac
 from __future__ import annotations
 
 import dataclasses
+from typing import Protocol
 
 import flax.struct
 import jax
@@ -47,6 +48,28 @@ class ScanBank:
     scans: PointCloud
     source_sizes: jax.Array
     reference: PointCloud
+
+    @property
+    def size(self) -> int:
+        """V, the number of views."""
+        return self.scans.mask.shape[0]
+
+    def draw(self, key: jax.Array, views: jax.Array, drawing: Drawing) -> Pair:
+        """`draw_pairs` of these views [B] i32."""
+        return draw_pairs(key, self, views, drawing)
+
+
+class Bank(Protocol):
+    """What pairs are drawn from: a pytree on the device."""
+
+    @property
+    def size(self) -> int:
+        """How many entries there are."""
+        ...
+
+    def draw(self, key: jax.Array, entries: jax.Array, drawing: Drawing) -> Pair:
+        """A batch from the entries [B] i32: sources [B, N] that share one target [M]."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)

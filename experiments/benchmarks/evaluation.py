@@ -46,7 +46,7 @@ def evaluation(bench: Bench) -> Iterator[Figure]:
                 )
                 times.append(json.loads(text))
     config = get_config()
-    model, sources = config.make_model(), config.make_drawing(scans).num_source
+    model, sources = config.make_network().model, config.make_drawing(scans).num_source
     targets, iterations = config.data.num_reference, config.model.test_iterations
     flops = inference_flops(model, sources, targets, iterations) + feature_flops(model, targets)
     limit = "arithmetic of an evaluation"
@@ -84,7 +84,7 @@ def measure(scans: ScanSet) -> dict[str, float]:
     bank = make_bank(scans, num_reference=config.data.num_reference)
     drawing = config.make_drawing(scans)
     variables = init_state(
-        config.make_model(), config.make_optimizer(), bank, drawing, seed=0
+        config.make_network().model, config.make_optimizer(), bank, drawing, seed=0
     ).variables
     part = config.make_part()
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):

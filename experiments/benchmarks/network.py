@@ -25,7 +25,7 @@ def step(bench: Bench) -> Iterator[Figure]:
     pairs = VanePairs()
     iterations = pairs.config.loss.iterations
     flops = step_flops(
-        pairs.config.make_model(), pairs.sources, pairs.targets, iterations, pairs.batch
+        pairs.config.make_network().model, pairs.sources, pairs.targets, iterations, pairs.batch
     )
     yield arithmetic(bench, "arithmetic of a step", flops)
     seconds, loss = bench.time(training(pairs))
@@ -45,7 +45,7 @@ def inference(bench: Bench) -> Iterator[Figure]:
     """One registration, the reference's features given."""
     pairs = VanePairs()
     flops = inference_flops(
-        pairs.config.make_model(), pairs.sources, pairs.targets, TEST_ITERATIONS
+        pairs.config.make_network().model, pairs.sources, pairs.targets, TEST_ITERATIONS
     )
     yield arithmetic(bench, "arithmetic of an inference", flops)
     seconds, _ = bench.time(registering(pairs))
@@ -91,7 +91,7 @@ def training(pairs: VanePairs) -> Callable[[], float]:
 
 def registering(pairs: VanePairs) -> Callable[[], RigidTransform]:
     """A registration of one pair, the reference's features computed before."""
-    model, variables = pairs.config.make_model(), pairs.state().variables
+    model, variables = pairs.config.make_network().model, pairs.state().variables
     pair = pairs.pair(0)
     features = jax.jit(lambda variables, cloud: model.apply(variables, cloud, method="features"))(
         variables, pair.target
