@@ -48,6 +48,44 @@ def squared_distances(a: jax.Array, b: jax.Array) -> jax.Array:
     return total
 
 
+def nearest_neighbors(
+    queries: jax.Array, xyz: jax.Array, mask: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The nearest point of a cloud to each query; of several, the first by index.
+
+    In blocks of queries, so that memory stays small. Over tiles of points only the least distance
+    is kept, and the one winning tile of each query is searched again for the index: an argmin over
+    everything takes ten times as long.
+
+    Args:
+      queries: [N, 3] f32, finite, below 1e18.
+      xyz: [M, 3] f32, in the same frame and unit.
+      mask: [M] bool; padding is no one's neighbour.
+
+    Returns:
+      indices [N] i32 and squared distances [N] f32; 0 and infinity where no point is real.
+    """
+    count, block, tile = queries.shape[0], 128, 64
+    if xyz.shape[0] == 0:
+        return jnp.zeros(count, jnp.int32), jnp.full(count, jnp.inf, queries.dtype)
+    far = jnp.where(mask[:, None], xyz, 1e18)  # its square is still finite
+    far = jnp.pad(far, ((0, -xyz.shape[0] % tile), (0, 0)), constant_values=1e18)
+    tiles = far.reshape(-1, tile, 3)
+
+    def search(some: jax.Array) -> tuple[jax.Array, jax.Array]:
+        least = jnp.min(squared_distances(far, some).reshape(-1, tile, block), axis=1)
+        winner = jnp.argmin(least, axis=0).astype(jnp.int32)
+        offsets = tiles[winner] - some[:, None, :]
+        squared = jnp.sum(offsets**2, axis=-1)
+        within = jnp.argmin(squared, axis=1).astype(jnp.int32)
+        return winner * tile + within, jnp.min(squared, axis=1)
+
+    blocks = jnp.pad(queries, ((0, -count % block), (0, 0))).reshape(-1, block, 3)
+    index, squared = (found.reshape(-1)[:count] for found in jax.lax.map(search, blocks))
+    some = jnp.any(mask)
+    return jnp.where(some, index, 0), jnp.where(some, squared, jnp.inf)
+
+
 def ball_query(xyz: jax.Array, mask: jax.Array, *, radius: float, num_neighbors: int) -> jax.Array:
     """The first ``num_neighbors`` other points by index within ``radius``.
 

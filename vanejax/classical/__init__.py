@@ -1,0 +1,1 @@
+"""Classical registration: closest points, robust estimation, sampled features."""
