@@ -112,7 +112,9 @@ def test_broken_files_are_refused(tmp_path: Path):
     whole = path.read_bytes()
     damaged = bytearray(whole)
     damaged[len(whole) // 3] ^= 0xFF
-    for data in (b"", b"PK", whole[: len(whole) // 2], bytes(damaged)):
+    stream = 30 + len("points_normals.npy") + 20  # past the local header and its sizes
+    not_deflate = whole[:stream] + b"\xff" * 4 + whole[stream + 4 :]
+    for data in (b"", b"PK", whole[: len(whole) // 2], bytes(damaged), not_deflate):
         path.write_bytes(data)
         with pytest.raises(InputError, match="cannot be read"):
             load_shapes(str(path), seed=0)
