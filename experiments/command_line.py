@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import os
 import re
 import sys
@@ -25,7 +26,7 @@ _OVERRIDE = re.compile(r"--?config\.([^=]+)")
 
 
 def define_config() -> flags.FlagHolder:
-    """Defines ``--config``; its value is an `Experiment` once flags are parsed."""
+    """Defines ``--config``; its value is what `run` is told it is once flags are parsed."""
     names = ", ".join(sorted(path.name for path in CONFIG_FOLDER.glob("[!_]*.py")))
     return config_flags.DEFINE_config_file(
         "config",
@@ -47,8 +48,10 @@ def workdir(given: flags.FlagHolder, config: flags.FlagHolder) -> Path:
     return Path(given.value or f"runs/{config.value.name}")
 
 
-def run(main: Callable[[], int | None]) -> None:
+def run(main: Callable[[], int | None], *, tree: type = Experiment) -> None:
     """Parses the command line, runs ``main`` and exits: 0, or 2 where the input is at fault.
+
+    ``tree`` is the dataclass that a config file's ``get_config()`` must return.
 
     Compiled programs are kept: `vanejax.compilation_cache`.
     """
@@ -62,6 +65,12 @@ def run(main: Callable[[], int | None]) -> None:
                 raise InputError(f"no such argument: {' '.join(rest[1:])}; see --help")
             if flags.FLAGS.config is None:
                 raise InputError("--config is missing; try --config vane.py, or --help")
+            if not isinstance(flags.FLAGS.config, tree):
+                kind = type(flags.FLAGS.config).__name__
+                raise InputError(
+                    f"--config: the file holds settings of the kind {kind}, this command takes "
+                    f"{tree.__name__}; see --help"
+                )
             compilation_cache.enable()
             return main() or 0
         except InputError as error:
@@ -70,7 +79,7 @@ def run(main: Callable[[], int | None]) -> None:
 
     try:
         argv = resolve_config(sys.argv)
-        app.run(guarded, argv=argv, flags_parser=_parse)
+        app.run(guarded, argv=argv, flags_parser=functools.partial(_parse, tree))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
@@ -105,32 +114,32 @@ def resolve_config(argv: list[str]) -> list[str]:
     return argv
 
 
-def _parse(argv: list[str]) -> list[str]:
+def _parse(tree: type, argv: list[str]) -> list[str]:
     """Absl's parser, with overrides checked first so that a typo lists the right names."""
     for argument in argv[1:]:
         if match := _OVERRIDE.match(argument):
-            _check_field(match.group(1))
+            _check_field(tree, match.group(1))
     try:
         return flags.FLAGS(argv)
     except flags.IllegalFlagValueError as error:
         match = _OVERRIDE.search(str(error))
-        wanted = f"; it takes {_kind(match.group(1))}" if match else ""
+        wanted = f"; it takes {_kind(tree, match.group(1))}" if match else ""
         raise InputError(f"{error}{wanted}") from error
     except (flags.Error, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{error}; see --help") from error
 
 
-def _kind(path: str) -> str:
+def _kind(tree: type, path: str) -> str:
     """What a field holds, such as "an int, for example 32"."""
-    value: Any = Experiment()
+    value: Any = tree()
     for name in path.split("."):
         value = getattr(value, name)
     kind = type(value).__name__
     return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}, for example {value!r}"
 
 
-def _check_field(path: str) -> None:
-    node: Any = Experiment()
+def _check_field(tree: type, path: str) -> None:
+    node: Any = tree()
     walked = "config"
     for name in path.split("."):
         names = [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []

@@ -12,11 +12,22 @@ from dataclasses import field
 import numpy as np
 import optax
 
-from experiments.networks import LossSettings, ModelSettings, Network, rpmnet_network
+from experiments.networks import (
+    DcpSettings,
+    LossSettings,
+    ModelSettings,
+    Network,
+    PcrNetSettings,
+    PointNetLKSettings,
+    dcp_network,
+    pcrnet_network,
+    pointnetlk_network,
+    rpmnet_network,
+)
 from vanejax.camera import Camera, Viewpoints, hemisphere_viewpoints
 from vanejax.dataset import ScanSet
 from vanejax.errors import InputError
-from vanejax.pairs import Bank, Drawing, make_bank, source_sizes
+from vanejax.pairs import Drawing, source_sizes
 from vanejax.part import Part, load_part
 from vanejax.training import make_optimizer
 from vanejax.vane import guide_vane
@@ -122,6 +133,8 @@ class Experiment:
     Attributes:
       name: of the run: the default work folder is ``runs/NAME``.
       seed: of everything random.
+      model, loss: which network is trained, and RPM-Net's settings.
+      dcp, pointnetlk, pcrnet: settings of the networks of these names, loss and all.
     """
 
     name: str = "vane"
@@ -131,6 +144,9 @@ class Experiment:
     data: DataSettings = field(default_factory=DataSettings)
     model: ModelSettings = field(default_factory=ModelSettings)
     loss: LossSettings = field(default_factory=LossSettings)
+    dcp: DcpSettings = field(default_factory=DcpSettings)
+    pointnetlk: PointNetLKSettings = field(default_factory=PointNetLKSettings)
+    pcrnet: PcrNetSettings = field(default_factory=PcrNetSettings)
     training: TrainingSettings = field(default_factory=TrainingSettings)
 
     def make_camera(self) -> Camera:
@@ -172,6 +188,9 @@ class Experiment:
         """
         makers: dict[str, Callable[[], Network]] = {
             "rpmnet": lambda: rpmnet_network(self.model, self.loss),
+            "dcp": lambda: dcp_network(self.dcp),
+            "pointnetlk": lambda: pointnetlk_network(self.pointnetlk),
+            "pcrnet": lambda: pcrnet_network(self.pcrnet),
         }
         if self.model.name not in makers:
             near = difflib.get_close_matches(self.model.name, makers, 1)
@@ -181,12 +200,6 @@ class Experiment:
                 f"(the names are {', '.join(makers)})"
             )
         return makers[self.model.name]()
-
-    def make_bank(self, scans: ScanSet) -> Bank:
-        """What training pairs are drawn from: the training views, or generic shapes."""
-        if not self.data.shapes:
-            return make_bank(scans.train, num_reference=self.data.num_reference)
-        raise NotImplementedError
 
     def make_optimizer(self) -> optax.GradientTransformation:
         """Adam with its schedule."""
@@ -210,12 +223,25 @@ class Experiment:
             "data": ("voxel_mm", "num_reference", "noise_clip"),
             "model": ("num_neighbors", "radius", "sinkhorn_iterations", "test_iterations"),
             "loss": ("iterations", "matching_sigma", "pairs_at_once"),
+            "dcp": (
+                "width",
+                "num_neighbors",
+                "heads",
+                "hidden",
+                "test_iterations",
+                "matching_sigma",
+            ),
+            "pointnetlk": ("delta", "test_iterations", "iterations", "pairs_at_once"),
+            "pcrnet": ("test_iterations", "iterations", "pairs_at_once"),
             "views": ("distance_mm", "resolution"),
         }
         positive["training"] += ("evaluate_every", "save_every", "keep", "validation_pairs")
         not_negative = {
             "data": ("noise", "max_rotation_deg", "max_translation"),
             "loss": ("discount", "pose", "inlier", "matching", "partner"),
+            "dcp": ("rotation", "translation", "cycle", "matching"),
+            "pointnetlk": ("damping", "discount", "matrix", "residual"),
+            "pcrnet": ("discount", "pose", "chamfer"),
             "training": ("warmup_steps", "final_fraction", "budget_minutes"),
         }
         for groups, least, words in ((positive, False, "positive"), (not_negative, True, ">= 0")):
@@ -234,5 +260,12 @@ class Experiment:
             raise InputError(
                 f"config.training.average_decay={self.training.average_decay} must lie in [0, 1)"
             )
-        if not any((self.loss.pose, self.loss.matching, self.loss.partner)):
-            raise InputError("config.loss: pose, matching and partner are all 0: nothing to learn")
+        factors = {
+            "loss": ("pose", "matching", "partner"),
+            "dcp": ("rotation", "translation", "matching"),
+            "pointnetlk": ("matrix", "residual"),
+            "pcrnet": ("pose", "chamfer"),
+        }
+        for group, names in factors.items():
+            if not any(getattr(getattr(self, group), name) for name in names):
+                raise InputError(f"config.{group}: {', '.join(names)} are all 0: nothing to learn")

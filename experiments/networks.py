@@ -9,10 +9,18 @@ from typing import Any
 import flax.linen as nn
 import jax
 
+from vanejax.dcp_loss import DcpLoss
+from vanejax.errors import InputError
+from vanejax.models.dcp import Dcp, dcp
+from vanejax.models.pcrnet import PcrNet, pcrnet
+from vanejax.models.pointnetlk import PointNetLK, pointnetlk
 from vanejax.models.rpmnet import RpmNet, rpmnet
+from vanejax.pointnet_losses import PcrNetLoss, PointNetLKLoss
 from vanejax.registration import Register, Registration
 from vanejax.rpmnet_loss import RpmNetLoss
 from vanejax.training import Loss, Variables
+
+ORIGINS = ("means", "target")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,3 +107,128 @@ def rpmnet_network(model: ModelSettings, loss: LossSettings) -> Network:
         factory=rpmnet,
         iterations=model.test_iterations,
     )
+
+
+@dataclasses.dataclass
+class DcpSettings:
+    """DCP and its loss; see `vanejax.models.dcp.Dcp` and `vanejax.dcp_loss.DcpLoss`.
+
+    Attributes:
+      width: channels of a feature; 512 as published.
+      num_neighbors: of the graph, the point itself counted.
+      heads: of every attention; divides ``width``.
+      hidden: channels inside a feed-forward layer; 1024 as published.
+      test_iterations: of the network at inference; 1 as published.
+      rotation, translation, cycle, matching, matching_sigma: of the loss.
+    """
+
+    width: int = 512
+    num_neighbors: int = 20
+    heads: int = 4
+    hidden: int = 1024
+    test_iterations: int = 1
+    rotation: float = 1.0
+    translation: float = 1.0
+    cycle: float = 0.0
+    matching: float = 0.0
+    matching_sigma: float = 0.04
+
+
+@dataclasses.dataclass
+class PointNetLKSettings:
+    """PointNetLK and its loss; see `vanejax.models.pointnetlk` and `vanejax.pointnet_losses`.
+
+    Attributes:
+      delta: step of the Jacobian's differences.
+      damping: of the normal equations.
+      origin: what clouds are centred on: means (of each, as published) or target.
+      test_iterations: of the network at inference; 10 as published.
+      iterations: in training.
+      discount, matrix, residual, pairs_at_once: of the loss.
+    """
+
+    delta: float = 0.01
+    damping: float = 1e-6
+    origin: str = "means"
+    test_iterations: int = 10
+    iterations: int = 10
+    discount: float = 0.5
+    matrix: float = 1.0
+    residual: float = 0.0
+    pairs_at_once: int = 1
+
+
+@dataclasses.dataclass
+class PcrNetSettings:
+    """PCRNet's loss; see `vanejax.models.pcrnet` and `vanejax.pointnet_losses.PcrNetLoss`.
+
+    Attributes:
+      test_iterations: of the network at inference; 8 as published.
+      iterations: in training.
+      discount, pose, chamfer, pairs_at_once: of the loss.
+    """
+
+    test_iterations: int = 8
+    iterations: int = 8
+    discount: float = 0.5
+    pose: float = 1.0
+    chamfer: float = 0.0
+    pairs_at_once: int = 1
+
+
+def dcp_network(settings: DcpSettings) -> Network:
+    """DCP as configured.
+
+    Raises:
+      InputError: the heads do not divide the width.
+    """
+    if settings.width % settings.heads:
+        raise InputError(
+            f"config.dcp.width={settings.width} must be a multiple of "
+            f"config.dcp.heads={settings.heads}"
+        )
+    model = ("width", "num_neighbors", "heads", "hidden")
+    loss = ("rotation", "translation", "cycle", "matching", "matching_sigma")
+    return Network(
+        title="DCP",
+        model=Dcp(**_some(settings, model)),
+        loss=DcpLoss(**_some(settings, loss)),
+        factory=dcp,
+        iterations=settings.test_iterations,
+    )
+
+
+def pointnetlk_network(settings: PointNetLKSettings) -> Network:
+    """PointNetLK as configured.
+
+    Raises:
+      InputError: an unknown origin.
+    """
+    if settings.origin not in ORIGINS:
+        raise InputError(
+            f"config.pointnetlk.origin={settings.origin!r} must be one of {', '.join(ORIGINS)}"
+        )
+    loss = ("iterations", "discount", "matrix", "residual", "pairs_at_once")
+    return Network(
+        title="PointNetLK",
+        model=PointNetLK(**_some(settings, ("delta", "damping", "origin"))),
+        loss=PointNetLKLoss(**_some(settings, loss)),
+        factory=pointnetlk,
+        iterations=settings.test_iterations,
+    )
+
+
+def pcrnet_network(settings: PcrNetSettings) -> Network:
+    """PCRNet as configured."""
+    loss = ("iterations", "discount", "pose", "chamfer", "pairs_at_once")
+    return Network(
+        title="PCRNet",
+        model=PcrNet(),
+        loss=PcrNetLoss(**_some(settings, loss)),
+        factory=pcrnet,
+        iterations=settings.test_iterations,
+    )
+
+
+def _some(settings: Any, names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: getattr(settings, name) for name in names}

@@ -74,7 +74,7 @@ def register_views(
         start = time.perf_counter()
         found = jax.block_until_ready(register(pair.source, pair.target, init, register_key))
         seconds = time.perf_counter() - start
-        measured = _measure(pair, found.target_from_source, unit_mm)
+        measured = measure(pair, found.target_from_source, unit_mm)
         rows.append(jax.device_get(Results(pair, found, *measured, time_s=np.float64(seconds))))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
@@ -91,9 +91,10 @@ def _draw(key: jax.Array, bank: ScanBank, view: jax.Array, drawing: Drawing) -> 
 
 
 @functools.partial(jax.jit, static_argnames="unit_mm")
-def _measure(
+def measure(
     pair: Pair, found: RigidTransform, unit_mm: float
 ) -> tuple[PoseErrors, SurfaceFit, SurfaceFit]:
+    """Errors of a pose of one pair, and how the clouds fit under it and under the true pose."""
     truth = pair.target_from_source
     fits = (
         surface_fit(pair.source.transform(pose), pair.target, unit_mm=unit_mm)

@@ -76,10 +76,10 @@ class RunFolder:
         record = self.path / "run.json"
         if record.exists():
             theirs = read_json(record)
-            differences = list(_differences(theirs, mine))
-            if differences:
+            changed = list(differences(theirs, mine))
+            if changed:
                 raise InputError(
-                    f"{self.path} holds a run of another experiment: {'; '.join(differences)}. "
+                    f"{self.path} holds a run of another experiment: {'; '.join(changed)}. "
                     "Choose another --workdir, or give the config that it was started with."
                 )
             return
@@ -90,6 +90,18 @@ class RunFolder:
             "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         }
         write_json(record, mine | environment)
+
+    def claim_shapes(self, title: str, sha256: str) -> None:
+        """Records which generic shapes a run is trained on, or checks that they are the same.
+
+        Raises:
+          InputError: the run was begun with other shapes.
+        """
+        record, mine = self.path / "shapes.json", {"title": title, "sha256": sha256}
+        if not record.exists():
+            write_json(record, mine)
+        elif changed := list(differences(read_json(record), mine)):
+            raise InputError(f"{self.path} was begun with other shapes: {'; '.join(changed)}")
 
     @property
     def seconds(self) -> float:
@@ -193,10 +205,10 @@ def git_commit() -> str | None:
         return None
 
 
-def _differences(old: Any, new: Any, path: str = "") -> Iterator[str]:
+def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:
     """Which fields of ``new`` differ from ``old``, as readable sentences."""
     if isinstance(new, dict) and isinstance(old, dict):
         for key in new:
-            yield from _differences(old.get(key), new[key], f"{path}.{key}" if path else key)
+            yield from differences(old.get(key), new[key], f"{path}.{key}" if path else key)
     elif old != new:
         yield f"{path} was {old!r}, now {new!r}"

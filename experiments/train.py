@@ -26,12 +26,14 @@ from experiments import command_line
 from experiments.evaluate import evaluate
 from experiments.experiment import Experiment, TrainingSettings
 from experiments.run_folder import RunFolder, training_record
+from experiments.shape_sets import load_shapes
 from vanejax.checkpoint import Checkpoints, all_finite, restore_or
 from vanejax.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
 from vanejax.metrics import pose_metrics
-from vanejax.pairs import Bank, Drawing
+from vanejax.pairs import Bank, Drawing, make_bank
 from vanejax.part import Part
 from vanejax.rigid import RigidTransform
+from vanejax.shape_pairs import ShapeBank
 from vanejax.training import (
     Metrics,
     TrainState,
@@ -96,7 +98,7 @@ def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
     """Trains on the training views of ``scans``; the test views are not looked at."""
     settings = config.training
     network, optimizer = config.make_network(), config.make_optimizer()
-    drawing, bank = config.make_drawing(scans), config.make_bank(scans)
+    drawing, bank = config.make_drawing(scans), training_bank(config, scans, folder)
     step = make_train_step(
         network.model,
         optimizer,
@@ -138,6 +140,16 @@ def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
             if leave and not last:
                 raise Interrupted(stop[0], done)
     return state
+
+
+def training_bank(config: Experiment, scans: ScanSet, folder: RunFolder) -> Bank:
+    """What training pairs are drawn from: the training views, or generic shapes."""
+    if not config.data.shapes:
+        return make_bank(scans.train, num_reference=config.data.num_reference)
+    shapes = load_shapes(config.data.shapes, seed=config.seed)
+    folder.claim_shapes(shapes.title, shapes.sha256)
+    print(f"training on {shapes.title}")
+    return ShapeBank(points=jnp.asarray(shapes.points), normals=jnp.asarray(shapes.normals))
 
 
 def over_budget(settings: TrainingSettings, seconds: float) -> bool:

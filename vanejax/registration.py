@@ -39,3 +39,17 @@ class Register(Protocol):
     ) -> Registration:
         """Finds target_from_source, starting at ``init``."""
         ...
+
+
+def in_turn(coarse: Register, fine: Register) -> Register:
+    """``fine`` starting where ``coarse`` ended; iterations add up, the rest is the second's."""
+
+    def register(
+        source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
+    ) -> Registration:
+        coarse_key, fine_key = jax.random.split(key)
+        first = coarse(source, target, init, coarse_key)
+        second = fine(source, target, first.target_from_source, fine_key)
+        return second.replace(iterations=first.iterations + second.iterations)
+
+    return register

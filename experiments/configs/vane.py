@@ -4,9 +4,9 @@ from experiments.experiment import Experiment, LossSettings, TrainingSettings
 
 
 def get_config() -> Experiment:
-    """About an hour on two cores."""
+    """Half an hour on two cores."""
     return Experiment(
         name="vane",
-        loss=LossSettings(matching=0.02),
+        loss=LossSettings(matching=0.02, matching_sigma=0.02),
         training=TrainingSettings(steps=4000, learning_rate=2e-3),
     )

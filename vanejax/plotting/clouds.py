@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -88,14 +88,8 @@ def registration_overlays(overlays: Sequence[Overlay]) -> Figure:
             color=INK,
             fontsize=10,
         )
-        finite = np.isfinite(overlay.rotation_error_deg + overlay.translation_error_mm)
         rows[1, column].set_title(
-            f"{overlay.rotation_error_deg:.2f}°, {overlay.translation_error_mm:.2f} mm"
-            if finite
-            else "no finite pose",
-            color=INK,
-            fontsize=10,
-            fontweight="bold",
+            _pose_error(overlay), color=INK, fontsize=10, fontweight="bold"
         )
     for axes, name in zip(rows[:, 0], ("before", "after"), strict=True):
         axes.text(
@@ -106,6 +100,41 @@ def registration_overlays(overlays: Sequence[Overlay]) -> Figure:
         _scale_bar(axes)
     _cloud_legend(figure, "source (virtual scan)", "reference (CAD)")
     return figure
+
+
+def method_overlays(overlays: Mapping[str, Overlay], *, columns: int = 4) -> Figure:
+    """One view after registration by several methods, as in the paper's Fig. 3.
+
+    Args:
+      overlays: by method, of the same view.
+      columns: panels side by side.
+
+    Raises:
+      InputError: no registration.
+    """
+    if not overlays:
+        raise InputError("method_overlays needs at least one registration")
+    limit = limits([c for o in overlays.values() for c in (o.moved, o.reference)])
+    columns = min(columns, len(overlays))
+    lines = -(-len(overlays) // columns)
+    height = _COLUMN_IN * height_per_width(limit)
+    figure = new_figure(_COLUMN_IN * columns + 0.3, (height + 0.5) * lines + 0.6)
+    panels = figure.subplots(lines, columns, squeeze=False)
+    for axes in panels.flat[len(overlays) :]:
+        axes.set_axis_off()
+    for axes, (name, overlay) in zip(panels.flat, overlays.items(), strict=False):
+        draw_overlay(axes, overlay.moved, overlay.reference)
+        set_limits(axes, limit)
+        axes.set_title(f"{name}\n{_pose_error(overlay)}", color=INK, fontsize=10)
+    _scale_bar(panels[0, 0])
+    _cloud_legend(figure, "source (virtual scan)", "reference (CAD)")
+    return figure
+
+
+def _pose_error(overlay: Overlay) -> str:
+    if not np.isfinite(overlay.rotation_error_deg + overlay.translation_error_mm):
+        return "no finite pose"
+    return f"{overlay.rotation_error_deg:.2f}°, {overlay.translation_error_mm:.2f} mm"
 
 
 def view_and_shadow(

@@ -1,0 +1,201 @@
+"""Table 1: every method of the paper on the same scans, its figures beside ours.
+
+python -m experiments.compare --config table1.py [--methods icp,rpmnet] [--workdir runs/table1]
+    [--trained rpmnet=runs/vane] [--config.FIELD=VALUE ...]
+
+Scans the part, trains the networks that are not given (hours; kill it and give the command again:
+it goes on), registers the 54 test views with each method from the same noisy points, and refines
+every answer by ray casting. Settings of the classical methods come from `experiments.tune`.
+
+VANEJAX_CACHE_DIR is where compiled programs are kept (~/.cache/vanejax); off keeps none.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from absl import flags
+
+from experiments import command_line, comparison_pictures, study
+from experiments.comparison import NETWORKS, OPEN3D, Comparison
+from experiments.comparison_table import table
+from experiments.fine_step import FineStep
+from experiments.machine import cores, cpu_model, peer_versions
+from experiments.methods import TABLE_1, TITLES, make_method, settings_of
+from experiments.registrations import Results, register_views
+from experiments.report import hardest_views, summarize
+from experiments.run_folder import git_commit, versions
+from experiments.train import Interrupted, TrainingDiverged, load_or_scan
+from experiments.trained import Trained, given_runs, trained
+from vanejax.dataset import ScanSet
+from vanejax.errors import InputError
+from vanejax.metrics import summary
+from vanejax.pairs import make_bank
+
+NEED_DEG, NEED_MM = 0.5, 1.0  # what the paper's machining process asks for
+
+
+def compare(
+    config: Comparison, workdir: Path, runs: Mapping[str, Path], *, progress: bool = True
+) -> dict[str, Any]:
+    """Trains what is to be trained, registers, refines, and reports.
+
+    Args:
+      config: methods and settings.
+      workdir: receives the networks' runs, comparison.json, table.md and pictures.
+      runs: folders of trained networks, by name; the others are trained here.
+      progress: whether to show progress bars.
+
+    Returns:
+      What comparison.json holds.
+
+    Raises:
+      InputError: settings, parts or folders that cannot be used.
+      TrainingDiverged, Interrupted: as `experiments.train.fit`.
+    """
+    config.check()
+    experiment = config.experiment
+    part = experiment.make_part()
+    workdir.mkdir(parents=True, exist_ok=True)
+    scans = load_or_scan(experiment, part, workdir / "scans.npz")
+    test = scans.test
+    if not len(test):
+        raise InputError("no test views: none of the azimuths is a multiple of 40 deg")
+    networks: dict[str, Trained] = {}
+    for name in (name for name in config.methods if name in NETWORKS):
+        print(f"{TITLES[name]}: {'taken from ' + str(runs[name]) if name in runs else 'training'}")
+        networks[name] = trained(
+            config.experiment_of(name), part, scans, workdir / name, runs.get(name)
+        )
+    bank = make_bank(test, num_reference=experiment.data.num_reference)
+    drawing, fine_step = experiment.make_drawing(scans), FineStep(part, test)
+    report: dict[str, Any] = {
+        "name": config.name,
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "machine": {"cpu": cpu_model(), "cores": cores()},
+        "commit": git_commit(),
+        "versions": versions() | peer_versions(),
+        "part": {"name": part.name, "sha256": part.sha256},
+        "seed": experiment.seed,
+        "config": dataclasses.asdict(config),
+        "views": len(test),
+        "hardest": hardest_views(test),
+        "need": {"rotation_deg": NEED_DEG, "translation_mm": NEED_MM},
+        "methods": [],
+    }
+    shown: dict[str, Results] = {}
+    for name in config.methods:
+        try:
+            register = make_method(name, config, networks.get(name))
+        except InputError as missing:
+            if name not in OPEN3D:
+                raise
+            report["methods"].append({"name": name, "title": TITLES[name], "skipped": str(missing)})
+            continue
+        print(f"{TITLES[name]}: registering")
+        results = register_views(
+            register,
+            bank,
+            drawing,
+            seed=experiment.seed,
+            unit_mm=scans.radius_mm,
+            progress=progress,
+        )
+        report["methods"].append(
+            {
+                "name": name,
+                "title": TITLES[name],
+                "paper": dataclasses.asdict(TABLE_1[name]) if name in TABLE_1 else None,
+                "settings": settings_of(name, config),
+                "training": training_told(networks.get(name)),
+                "alone": figures(results, test),
+                "refined": figures(fine_step(results), test),
+            }
+        )
+        shown[name] = results
+    report = study.save(workdir, "comparison", report)
+    (workdir / "table.md").write_text(table(report))
+    comparison_pictures.draw(report, shown, test, workdir)
+    print(table(report))
+    return report
+
+
+def figures(results: Results, scans: ScanSet) -> dict[str, Any]:
+    """Summaries over all views and the hardest, the success rate, and every view's pose error."""
+    found = summarize(results, scans)
+    rotation, translation = results.errors.rotation_deg, results.errors.translation_mm
+    # NaN is no success
+    success = (rotation < NEED_DEG) & (translation < NEED_MM)
+    return {
+        "success": np.mean(success),
+        "non_finite_views": found["non_finite_views"],
+        "summary": found["summary"],
+        "hardest": found["hardest"]["summary"],
+        "mre_per_axis_deg": found["mre_per_axis_deg"],
+        "mte_per_axis_mm": found["mte_per_axis_mm"],
+        "at_true_pose": found["at_true_pose"],
+        "converged": np.mean(results.registration.converged),
+        "turned_over": np.mean(~(rotation < 90)),
+        "overlap": summary(results.registration.overlap),
+        "rotation_error_deg": rotation,
+        "translation_error_mm": translation,
+    }
+
+
+def training_told(network: Trained | None) -> dict[str, Any] | None:
+    """How a network was trained, without its curve; None where there is none."""
+    if network is None:
+        return None
+    told = network.record.summary(network.config.training.steps)
+    model = network.config.make_network().model
+    leaves = jax.tree.leaves(network.variables)
+    return {
+        "steps": told["steps"],
+        "wanted_steps": told["wanted_steps"],
+        "ended_by": told["ended_by"],
+        "hours": told["hours"],
+        "fall_in_last_quarter": told["fall_in_last_quarter"],
+        "flat": told["flat"],
+        "parameters": sum(leaf.size for leaf in leaves),
+        "model": type(model).__name__,
+    }
+
+
+def main(config: Comparison, workdir: Path, methods: list[str], words: list[str]) -> int:
+    """Compares; the exit code."""
+    if methods:
+        config.methods = tuple(methods)
+    try:
+        compare(config, workdir, given_runs(words, NETWORKS))
+    except Interrupted as stop:
+        print(f"{stop}; saved in {workdir}. Run the same command to go on.", file=sys.stderr)
+        return 128 + stop.signal
+    except TrainingDiverged as trouble:
+        print(f"error: training stopped: {trouble}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    CONFIG = command_line.define_config()
+    WORKDIR = command_line.define_workdir()
+    CHOICE = flags.DEFINE_list(
+        "methods", [], "these only, such as icp,rpmnet; the config's if none"
+    )
+    RUNS = flags.DEFINE_multi_string(
+        "trained", [], "NAME=FOLDER: take this network from a finished run instead of training it"
+    )
+
+    def run() -> int:
+        """The command."""
+        workdir = command_line.workdir(WORKDIR, CONFIG)
+        return main(CONFIG.value, workdir, CHOICE.value, RUNS.value)
+
+    command_line.run(run, tree=Comparison)

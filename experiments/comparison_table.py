@@ -1,0 +1,97 @@
+"""A comparison as a Markdown table: the paper's figures beside ours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+HEAD = (
+    "method",
+    "paper: RMSE, FFMDE (mm), time (s)",
+    "FFMDE, absolute (mm)",
+    "signed (mm)",
+    "RMSE (mm)",
+    "rotation error (deg)",
+    "translation error (mm)",
+    "in need",
+    "time (s)",
+    "refined: rotation (deg)",
+    "translation (mm)",
+    "in need",
+)
+
+
+def table(report: Mapping[str, Any]) -> str:
+    """One line for each method; errors as mean / median / p95 over the test views."""
+    need = report["need"]
+    lines = [
+        f"{report['views']} test views of the {report['part']['name']}; mean / median / 95 %. "
+        f"In need: within {need['rotation_deg']:g} deg and {need['translation_mm']:g} mm.",
+        "",
+        "| " + " | ".join(HEAD) + " |",
+        "|" + "---|" * len(HEAD),
+    ]
+    for method in report["methods"]:
+        if "skipped" in method:
+            lines.append(f"| {method['title']} | {method['skipped']} |" + " |" * (len(HEAD) - 2))
+        else:
+            lines.append("| " + " | ".join(_cells(method)) + " |")
+    floor = next((m["alone"]["at_true_pose"] for m in report["methods"] if "alone" in m), None)
+    if floor:
+        lines += [
+            "",
+            "At the true pose noise and spacing of the points alone give a mean RMSE of "
+            f"{floor['rmse_mm']['mean']:.3g} mm and an absolute FFMDE of "
+            f"{floor['ffmde_abs_mm']['mean']:.3g} mm.",
+        ]
+    trained = [method for method in report["methods"] if method.get("training")]
+    lines += [""] + [_training(method) for method in trained]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _cells(method: Mapping[str, Any]) -> list[str]:
+    alone, refined, paper = method["alone"], method["refined"], method["paper"]
+    figures = alone["summary"]
+    published = (
+        ""
+        if paper is None
+        else f"{paper['rmse_mm']:.2f}, {paper['ffmde_mm']:.2f}, {paper['time_s']:.2g}"
+    )
+    return [
+        method["title"],
+        published,
+        _spread(figures["ffmde_abs_mm"]),
+        _number(figures["ffmde_signed_mm"]["mean"]),
+        _spread(figures["rmse_mm"]),
+        _spread(figures["rotation_error_deg"]),
+        _spread(figures["translation_error_mm"]),
+        f"{alone['success']:.0%}",
+        _number(figures["time_s"]["median"]),
+        _spread(refined["summary"]["rotation_error_deg"]),
+        _spread(refined["summary"]["translation_error_mm"]),
+        f"{refined['success']:.0%}",
+    ]
+
+
+def _training(method: Mapping[str, Any]) -> str:
+    """How long a network was trained, and whether its curve is flat."""
+    told = method["training"]
+    steps = f"{told['steps']:,} steps"
+    if told["ended_by"] == "budget":
+        steps = f"{steps} of {told['wanted_steps']:,}, ended by its budget of time"
+    fall = told["fall_in_last_quarter"]
+    curve = "too few validations to say whether the curve is flat"
+    if fall is not None:
+        curve = (
+            f"validation error {'fell by' if fall >= 0 else 'rose by'} {abs(fall):.0%} in the last "
+            f"quarter: {'flat' if told['flat'] else 'not flat yet'}"
+        )
+    return f"- {method['title']}: {steps}, {told['hours']:.2f} h; {curve}."
+
+
+def _spread(figures: Mapping[str, float]) -> str:
+    return " / ".join(_number(figures[name]) for name in ("mean", "median", "p95"))
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"

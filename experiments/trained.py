@@ -1,0 +1,88 @@
+"""A trained network for a comparison: trained here and now, or taken from the folder of a run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+from experiments.evaluate import load_variables
+from experiments.experiment import Experiment
+from experiments.run_folder import RunFolder, differences, read_json, training_record
+from experiments.train import fit
+from experiments.training_record import TrainingRecord
+from vanejax.dataset import ScanSet
+from vanejax.errors import InputError
+from vanejax.part import Part
+from vanejax.training import Variables
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """Weights, and the run that they are of.
+
+    Attributes:
+      variables: averaged weights of the last step.
+      config: of the run.
+      record: of its training.
+    """
+
+    variables: Variables
+    config: Experiment
+    record: TrainingRecord
+
+
+def trained(
+    config: Experiment, part: Part, scans: ScanSet, folder: Path, given: Path | None = None
+) -> Trained:
+    """Trains in ``folder``, going on where a run there was interrupted; or loads a ``given`` run.
+
+    Raises:
+      InputError: the given folder holds a run of another network, part or kind of data.
+      TrainingDiverged, Interrupted: as `experiments.train.fit`.
+    """
+    if given is None:
+        with RunFolder(folder) as run:
+            run.claim(config, part)
+            variables = fit(config, scans, run).average
+        return Trained(variables, config, training_record(folder))
+    record = read_json(given / "run.json")
+    mine = json.loads(json.dumps(dataclasses.asdict(config)))
+    theirs = record.get("config", {})
+    # what decides how a network is built and tested; how it was trained is told, not asked for
+    groups = ("part", "views", "data", "model", config.model.name)
+    names = [name for name in groups if name in mine]
+    found = list(
+        differences(
+            {name: theirs.get(name) for name in names}, {name: mine[name] for name in names}
+        )
+    )
+    if record.get("part", {}).get("sha256") != part.sha256:
+        found.append(f"it is about the part {record.get('part', {}).get('name')}")
+    if found:
+        raise InputError(f"{given}: is no run for this comparison: {'; '.join(found)}")
+    for name in ("training", "loss"):
+        if isinstance(theirs.get(name), dict):
+            settings = getattr(config, name)
+            known = {field.name for field in dataclasses.fields(settings)}
+            values = {key: value for key, value in theirs[name].items() if key in known}
+            setattr(config, name, dataclasses.replace(settings, **values))
+    return Trained(load_variables(config, scans, given), config, training_record(given))
+
+
+def given_runs(words: Iterable[str], names: Iterable[str]) -> dict[str, Path]:
+    """Folders by network from ``NAME=FOLDER`` arguments.
+
+    Raises:
+      InputError: no such network or folder, or an argument of another form.
+    """
+    runs: dict[str, Path] = {}
+    for word in words:
+        name, equals, folder = word.partition("=")
+        if not equals or name not in names:
+            raise InputError(f"--trained {word}: should be NAME=FOLDER with {', '.join(names)}")
+        if not Path(folder).is_dir():
+            raise InputError(f"--trained {word}: there is no folder {folder}")
+        runs[name] = Path(folder)
+    return runs
