@@ -209,6 +209,15 @@ def test_a_kernel_that_refuses_every_pair_leaves_the_start():
     assert_close(found.target_from_source, init, 0)
 
 
+@pytest.mark.parametrize("loose", ["tolerance_rotation_deg", "tolerance_translation"])
+def test_it_rests_only_below_both_tolerances(loose):
+    source, target = pair()
+    init = motion([0.0, 0.1, 0.1], [0.0, 0.0, 0.05])
+    found = register(**{loose: 180.0})(source, target, init, KEY)
+    assert found.iterations > 1
+    assert_close(found.target_from_source, TRUTH, 5e-5)  # three times 1e-3 deg, where it rests
+
+
 # ---- laws ----
 
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vanejax.pointcloud import PointCloud, squared_distances
+from vanejax.pointcloud import PointCloud, nearest_neighbors
 from vanejax.rigid import RigidTransform, euler_xyz_deg, rotation_angle
 
 
@@ -137,8 +137,9 @@ def nearest_offsets(moved: PointCloud, reference: PointCloud) -> tuple[jax.Array
       ``y_i - x_i`` [N, 3] and the unit normals n_i [N, 3] of the y_i; of no meaning where ``moved``
       is padding. Without a reference point the offsets are NaN.
     """
-    squared = squared_distances(moved.xyz, reference.xyz)
-    nearest = jnp.argmin(jnp.where(reference.mask[None, :], squared, jnp.inf), axis=1)
+    # an index has no gradient: this spares the search from being kept for a backward pass
+    queries, points = jax.lax.stop_gradient((moved.xyz, reference.xyz))
+    nearest, _ = nearest_neighbors(queries, points, reference.mask)
     offsets = reference.xyz[nearest] - moved.xyz
     return jnp.where(jnp.any(reference.mask), offsets, jnp.nan), reference.normals[nearest]
 
