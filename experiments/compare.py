@@ -122,7 +122,8 @@ def compare(
         shown[name] = results
     report = study.save(workdir, "comparison", report)
     (workdir / "table.md").write_text(table(report))
-    comparison_pictures.draw(report, shown, test, workdir)
+    if shown:
+        comparison_pictures.draw(report, shown, test, workdir)
     print(table(report))
     return report
 

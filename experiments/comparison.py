@@ -19,7 +19,7 @@ METHODS = CLASSICAL + NETWORKS + OPEN3D
 
 @dataclasses.dataclass
 class IcpSettings:
-    """ICP's; see `vanejax.classical.icp.icp`. Lengths in unit-sphere units."""
+    """ICP's, ours and Open3D's; see `vanejax.classical.icp.icp`. Unit-sphere units."""
 
     metric: str = "point_to_plane"
     max_iterations: int = 50
@@ -33,9 +33,9 @@ class IcpSettings:
 class SacIaSettings:
     """SAC-IA's; see `vanejax.classical.sac_ia.sac_ia`. Lengths in unit-sphere units."""
 
-    feature_radius: float = 0.4
+    feature_radius: float = 0.35
     max_distance: float = 0.1
-    num_hypotheses: int = 20_000
+    num_hypotheses: int = 100_000
     num_candidates: int = 3
 
 
@@ -43,36 +43,27 @@ class SacIaSettings:
 class FgrSettings:
     """FGR's; see `vanejax.classical.fgr.fgr`. Lengths in unit-sphere units."""
 
-    feature_radius: float = 0.4
+    feature_radius: float = 0.35
     max_distance: float = 0.05
-    tuple_similarity: float = 0.95
+    num_candidates: int = 10
+    tuple_similarity: float = 0.9
     num_tuples: int = 1000
 
 
 @dataclasses.dataclass
-class Open3dIcpSettings:
-    """Open3D's ICP; see `experiments.open3d_methods.open3d_icp`."""
-
-    metric: str = "plane"
-    max_iterations: int = 50
-    max_distance: float = 0.3
-
-
-@dataclasses.dataclass
 class Open3dRansacSettings:
-    """Open3D's RANSAC on FPFH; see `experiments.open3d_methods.open3d_ransac`."""
+    """Open3D's RANSAC on FPFH; see `experiments.open3d_methods.ransac`. Unit-sphere units."""
 
-    feature_radius: float = 0.4
+    feature_radius: float = 0.35
     max_distance: float = 0.1
-    max_iterations: int = 100_000
-    refine: str = "plane"
+    num_hypotheses: int = 100_000
 
 
 @dataclasses.dataclass
 class Open3dFgrSettings:
-    """Open3D's FGR; see `experiments.open3d_methods.open3d_fgr`."""
+    """Open3D's FGR; see `experiments.open3d_methods.fgr`. Lengths in unit-sphere units."""
 
-    feature_radius: float = 0.4
+    feature_radius: float = 0.35
     max_distance: float = 0.05
     tuple_similarity: float = 0.95
     num_tuples: int = 1000
@@ -99,7 +90,8 @@ class Comparison:
         ``training`` and ``model.name`` are set for each network.
       training: of each network.
       icp, sac_ia, fgr: of ours; ``fine_icp`` follows SAC-IA.
-      open3d_icp, open3d_ransac, open3d_fgr: of Open3D's, tuned for themselves.
+      open3d_icp, open3d_ransac, open3d_fgr: of Open3D's, tuned for themselves;
+        ``open3d_fine_icp`` follows RANSAC.
     """
 
     name: str = "table1"
@@ -110,7 +102,8 @@ class Comparison:
     fine_icp: IcpSettings = field(default_factory=IcpSettings)
     sac_ia: SacIaSettings = field(default_factory=SacIaSettings)
     fgr: FgrSettings = field(default_factory=FgrSettings)
-    open3d_icp: Open3dIcpSettings = field(default_factory=Open3dIcpSettings)
+    open3d_icp: IcpSettings = field(default_factory=IcpSettings)
+    open3d_fine_icp: IcpSettings = field(default_factory=IcpSettings)
     open3d_ransac: Open3dRansacSettings = field(default_factory=Open3dRansacSettings)
     open3d_fgr: Open3dFgrSettings = field(default_factory=Open3dFgrSettings)
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import jax
 
-from experiments.comparison import NETWORKS, Comparison
-from experiments.open3d_methods import open3d_fgr, open3d_icp, open3d_ransac
+from experiments import open3d_methods
+from experiments.comparison import NETWORKS, Comparison, IcpSettings
 from experiments.trained import Trained
 from vanejax.classical.fgr import fgr
 from vanejax.classical.icp import icp
@@ -36,7 +36,7 @@ GROUPS = {
     "sac_ia_icp": ("sac_ia", "fine_icp"),
     "fgr": ("fgr",),
     "open3d_icp": ("open3d_icp",),
-    "open3d_ransac_icp": ("open3d_ransac",),
+    "open3d_ransac_icp": ("open3d_ransac", "open3d_fine_icp"),
     "open3d_fgr": ("open3d_fgr",),
 }
 
@@ -76,14 +76,17 @@ def make_method(name: str, config: Comparison, network: Trained | None = None) -
         assert network is not None
         return network.config.make_network().register(network.variables)
     makers: dict[str, Callable[[], Register]] = {
-        "icp": lambda: jax.jit(icp(**_fields(config.icp))),
+        "icp": lambda: jax.jit(icp(**_icp_fields(config.icp))),
         "sac_ia_icp": lambda: jax.jit(
-            in_turn(sac_ia(**_fields(config.sac_ia)), icp(**_fields(config.fine_icp)))
+            in_turn(sac_ia(**_fields(config.sac_ia)), icp(**_icp_fields(config.fine_icp)))
         ),
         "fgr": lambda: jax.jit(fgr(**_fields(config.fgr))),
-        "open3d_icp": lambda: open3d_icp(**_fields(config.open3d_icp)),
-        "open3d_ransac_icp": lambda: open3d_ransac(**_fields(config.open3d_ransac)),
-        "open3d_fgr": lambda: open3d_fgr(**_fields(config.open3d_fgr)),
+        "open3d_icp": lambda: open3d_methods.icp(**_icp_fields(config.open3d_icp)),
+        "open3d_ransac_icp": lambda: in_turn(
+            open3d_methods.ransac(**_fields(config.open3d_ransac)),
+            open3d_methods.icp(**_icp_fields(config.open3d_fine_icp)),
+        ),
+        "open3d_fgr": lambda: open3d_methods.fgr(**_fields(config.open3d_fgr)),
     }
     return makers[name]()
 
@@ -99,3 +102,9 @@ def settings_of(name: str, config: Comparison) -> dict[str, Any]:
 
 def _fields(settings: Any) -> dict[str, Any]:
     return dataclasses.asdict(settings)
+
+
+def _icp_fields(settings: IcpSettings) -> dict[str, Any]:
+    """Without a kernel there is no width of it."""
+    fields = _fields(settings)
+    return fields | {"kernel_width": None} if settings.kernel == "none" else fields

@@ -43,7 +43,7 @@ GRIDS: dict[str, dict[str, Sequence[Any]]] = {
         "icp.metric": ("point_to_point", "point_to_plane"),
         "icp.max_distance": (0.2, 0.4, 0.8, 1.6),
         "icp.kernel": ("none", "huber"),
-        "icp.trim": (1.0, 0.9),
+        "icp.trim": (1.0, 0.8),
     },
     "sac_ia_icp": {
         "sac_ia.feature_radius": _FEATURES,
@@ -56,12 +56,14 @@ GRIDS: dict[str, dict[str, Sequence[Any]]] = {
         "fgr.tuple_similarity": (0.9, 0.95),
     },
     "open3d_icp": {
-        "open3d_icp.metric": ("point", "plane"),
-        "open3d_icp.max_distance": (0.1, 0.2, 0.4, 0.8, 1.6),
+        "open3d_icp.metric": ("point_to_point", "point_to_plane"),
+        "open3d_icp.max_distance": (0.2, 0.4, 0.8, 1.6),
+        "open3d_icp.kernel": ("none", "huber"),
     },
     "open3d_ransac_icp": {
         "open3d_ransac.feature_radius": _FEATURES,
-        "open3d_ransac.max_distance": (0.025, *_DISTANCES),
+        "open3d_ransac.max_distance": _DISTANCES,
+        "open3d_fine_icp.max_distance": (0.05, 0.1),
     },
     "open3d_fgr": {
         "open3d_fgr.feature_radius": _FEATURES,

@@ -1,0 +1,158 @@
+"""Table 1: the command end to end on little, and what its table, pictures and runs say."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import compare as command
+from experiments.compare import compare, main
+from experiments.comparison import METHODS, Comparison
+from experiments.comparison_table import HEAD, table
+from experiments.configs import smoke, table1
+from experiments.methods import GROUPS, TABLE_1, TITLES, make_method, settings_of
+from experiments.trained import given_runs, trained
+from vanejax.errors import InputError
+
+
+def small() -> Comparison:
+    """Few pixels and points, two steps of training: its figures mean nothing."""
+    config = Comparison(name="small", experiment=smoke.get_config(), methods=("icp", "pcrnet"))
+    config.experiment.views.azimuths_deg = (0.0, 20.0, 40.0, 180.0)
+    config.training.pcrnet = dataclasses.replace(
+        smoke.get_config().training, steps=2, evaluate_every=1, validation_pairs=2
+    )
+    return config
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("table1")
+
+
+@pytest.fixture(scope="module")
+def report(folder: Path) -> dict:
+    return compare(small(), folder, {}, progress=False)
+
+
+def test_every_method_is_compared_alone_and_refined(report: dict, folder: Path) -> None:
+    assert [method["name"] for method in report["methods"]] == ["icp", "pcrnet"]
+    for method in report["methods"]:
+        for stage in ("alone", "refined"):
+            figures = method[stage]
+            assert len(figures["rotation_error_deg"]) == report["views"] == 4
+            assert 0 <= figures["success"] <= 1
+            assert figures["summary"]["ffmde_abs_mm"]["mean"] > 0
+    icp, pcrnet = report["methods"]
+    assert icp["training"] is None
+    assert icp["paper"] == {"rmse_mm": 8.8914, "ffmde_mm": 3.7936, "time_s": 0.0344}
+    assert pcrnet["training"]["steps"] == 2
+    assert pcrnet["training"]["ended_by"] == "steps"
+    # the fine step lowers the errors of a method that comes near
+    near = np.array(icp["alone"]["rotation_error_deg"]) < 20
+    assert near.any()
+    before, after = (np.array(icp[s]["rotation_error_deg"])[near] for s in ("alone", "refined"))
+    assert np.median(after) < np.median(before)
+    # both saw the same points: at the true pose they fit alike
+    fits = [method["alone"]["at_true_pose"]["rmse_mm"] for method in report["methods"]]
+    assert fits[0] == fits[1]
+    assert json.loads((folder / "comparison.json").read_text()) == report
+    for name in ("errors.png", "methods.png"):
+        assert (folder / name).stat().st_size > 10_000
+
+
+def test_the_table_has_the_papers_figures_beside_ours(report: dict, folder: Path) -> None:
+    text = table(report)
+    assert (folder / "table.md").read_text() == text
+    rows = [line for line in text.splitlines() if line.startswith("| ICP")]
+    assert len(rows) == 1
+    assert rows[0].count("|") == len(HEAD) + 1
+    assert "8.89, 3.79, 0.034" in rows[0]
+    assert "2 steps" in text
+
+
+def test_a_finished_run_is_taken_instead_of_training(report: dict, folder: Path, capsys) -> None:
+    config = small()
+    config.methods = ("pcrnet",)
+    other = folder / "other"
+    again = compare(config, other, {"pcrnet": folder / "pcrnet"}, progress=False)
+    assert not (other / "pcrnet").exists()
+    alone = again["methods"][0]["alone"]
+    assert alone["rotation_error_deg"] == report["methods"][1]["alone"]["rotation_error_deg"]
+
+
+def test_a_run_of_something_else_is_refused(report: dict, folder: Path) -> None:
+    config = small()
+    config.experiment.data.noise = 0.5
+    experiment = config.experiment_of("pcrnet")
+    part = experiment.make_part()
+    with pytest.raises(InputError, match=r"data\.noise was 0\.01, now 0\.5"):
+        trained(experiment, part, None, folder / "x", folder / "pcrnet")
+    experiment = small().experiment_of("dcp")
+    with pytest.raises(InputError, match=r"model\.name was 'pcrnet', now 'dcp'"):
+        trained(experiment, part, None, folder / "x", folder / "pcrnet")
+
+
+def test_given_runs_are_checked(tmp_path: Path) -> None:
+    assert given_runs([f"dcp={tmp_path}"], ("dcp",)) == {"dcp": tmp_path}
+    for word, message in (
+        ("dcp", "NAME=FOLDER"),
+        (f"icp={tmp_path}", "NAME=FOLDER with dcp"),
+        ("dcp=/no/such", "no folder /no/such"),
+    ):
+        with pytest.raises(InputError, match=message):
+            given_runs([word], ("dcp",))
+
+
+def test_unknown_and_repeated_methods_are_refused() -> None:
+    for methods, message in (
+        (("icp", "ipc"), "methods ipc"),
+        (("icp", "icp"), "named twice"),
+        ((), "are none"),
+    ):
+        config = Comparison(methods=methods)
+        with pytest.raises(InputError, match=message):
+            config.check()
+
+
+def test_a_missing_peer_is_a_line_and_no_failure(monkeypatch, tmp_path: Path) -> None:
+    def missing(name: str, *_: object) -> None:
+        raise InputError("needs the extra peers")
+
+    monkeypatch.setattr(command, "make_method", missing)
+    config = small()
+    config.methods = ("open3d_icp",)
+    report = compare(config, tmp_path, {}, progress=False)
+    assert report["methods"][0]["skipped"] == "needs the extra peers"
+    assert "needs the extra peers" in table(report)
+    config.methods = ("icp",)
+    with pytest.raises(InputError, match="peers"):
+        compare(config, tmp_path, {}, progress=False)
+
+
+def test_the_config_of_table_1_has_all_methods_with_their_settings() -> None:
+    config = table1.get_config()
+    config.check()
+    assert config.methods == METHODS == tuple(TITLES)
+    assert set(TABLE_1) == {name for name in METHODS if not name.startswith("open3d")}
+    for name in METHODS:
+        settings = settings_of(name, config)
+        assert settings
+        if name in GROUPS and not name.startswith("open3d"):
+            assert callable(make_method(name, config))
+    dcp = config.experiment_of("dcp")
+    assert dcp.model.name == "dcp"
+    assert dcp.training.steps == config.training.dcp.steps
+    assert dcp.data == config.experiment.data
+
+
+def test_methods_on_the_command_line_replace_the_configs(monkeypatch, tmp_path: Path) -> None:
+    seen = []
+    monkeypatch.setattr(command, "compare", lambda config, *rest: seen.append(config.methods))
+    assert main(small(), tmp_path, ["fgr"], []) == 0
+    assert main(small(), tmp_path, [], []) == 0
+    assert seen == [("fgr",), ("icp", "pcrnet")]
