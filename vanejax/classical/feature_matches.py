@@ -76,7 +76,8 @@ def nearest_matches(distances: jax.Array, *, num_candidates: int, mutual: bool) 
     negative, target = jax.lax.top_k(-distances, k)
     mask = negative > -_FAR
     if mutual:
-        back = jax.lax.top_k(-distances.T, min(k, n))[0][:, -1]  # the K-th nearest of each target
+        # what a target point's K-th nearest reaches
+        back = jax.lax.top_k(-distances.T, min(num_candidates, n))[0][:, -1]
         mask &= negative >= back[target]
     source = jnp.broadcast_to(jnp.arange(n, dtype=jnp.int32)[:, None], (n, k))
     return Matches(source=source.reshape(-1), target=target.reshape(-1), mask=mask.reshape(-1))

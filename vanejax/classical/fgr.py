@@ -22,11 +22,11 @@ def fgr(
     max_distance: float,
     division: float = 1.4,
     iterations: int = 64,
-    num_candidates: int = 5,
+    num_candidates: int = 10,
     tuple_similarity: float = 0.9,
     max_normal_angle: float = 0.5,
     num_tuples: int = 1000,
-    num_trials: int = 50_000,
+    num_trials: int = 100_000,
 ) -> Register:
     """Fast Global Registration; the guess is used only where nothing is found.
 

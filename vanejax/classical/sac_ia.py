@@ -33,7 +33,7 @@ def sac_ia(
     *,
     feature_radius: float,
     max_distance: float,
-    num_hypotheses: int = 50_000,
+    num_hypotheses: int = 100_000,
     num_candidates: int = 3,
     edge_similarity: float = 0.9,
     max_normal_angle: float = 0.5,
