@@ -103,7 +103,7 @@ def test_padding_does_not_matter():
     """Behind the real points: the same tuples are drawn, and sums differ by rounding alone."""
     padded = [
         PointCloud(
-            xyz=np.concatenate([cloud.xyz, np.full((40, 3), 7.0, np.float32)]),
+            xyz=np.concatenate([cloud.xyz, cloud.xyz[:40] + np.float32(0.03)]),
             normals=np.concatenate([cloud.normals, cloud.normals[:40]]),
             mask=np.arange(N + 40) < N,
         )
