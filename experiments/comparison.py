@@ -11,7 +11,7 @@ from dataclasses import field
 from experiments.experiment import Experiment, TrainingSettings
 from vanejax.errors import InputError
 
-CLASSICAL = ("icp", "sac_ia_icp", "fgr")
+CLASSICAL = ("icp", "sac_ia", "sac_ia_icp", "fgr")
 NETWORKS = ("dcp", "pointnetlk", "pcrnet", "rpmnet")
 OPEN3D = ("open3d_icp", "open3d_ransac_icp", "open3d_fgr")
 METHODS = CLASSICAL + NETWORKS + OPEN3D
@@ -33,7 +33,7 @@ class IcpSettings:
 class SacIaSettings:
     """SAC-IA's; see `vanejax.classical.sac_ia.sac_ia`. Lengths in unit-sphere units."""
 
-    feature_radius: float = 0.35
+    feature_radius: float = 0.3
     max_distance: float = 0.1
     num_hypotheses: int = 100_000
     num_candidates: int = 3
@@ -43,7 +43,7 @@ class SacIaSettings:
 class FgrSettings:
     """FGR's; see `vanejax.classical.fgr.fgr`. Lengths in unit-sphere units."""
 
-    feature_radius: float = 0.35
+    feature_radius: float = 0.3
     max_distance: float = 0.05
     num_candidates: int = 10
     tuple_similarity: float = 0.9
@@ -54,7 +54,7 @@ class FgrSettings:
 class Open3dRansacSettings:
     """Open3D's RANSAC on FPFH; see `experiments.open3d_methods.ransac`. Unit-sphere units."""
 
-    feature_radius: float = 0.35
+    feature_radius: float = 0.3
     max_distance: float = 0.1
     num_hypotheses: int = 100_000
 
@@ -63,7 +63,7 @@ class Open3dRansacSettings:
 class Open3dFgrSettings:
     """Open3D's FGR; see `experiments.open3d_methods.fgr`. Lengths in unit-sphere units."""
 
-    feature_radius: float = 0.35
+    feature_radius: float = 0.3
     max_distance: float = 0.05
     tuple_similarity: float = 0.95
     num_tuples: int = 1000

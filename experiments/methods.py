@@ -18,6 +18,7 @@ from vanejax.registration import Register, in_turn
 
 TITLES = {
     "icp": "ICP",
+    "sac_ia": "SAC-IA",
     "sac_ia_icp": "SAC-IA + ICP",
     "fgr": "FGR",
     "dcp": "DCP",
@@ -33,6 +34,7 @@ TITLES = {
 # of the configuration, by method that is not a network
 GROUPS = {
     "icp": ("icp",),
+    "sac_ia": ("sac_ia",),
     "sac_ia_icp": ("sac_ia", "fine_icp"),
     "fgr": ("fgr",),
     "open3d_icp": ("open3d_icp",),
@@ -77,6 +79,7 @@ def make_method(name: str, config: Comparison, network: Trained | None = None) -
         return network.config.make_network().register(network.variables)
     makers: dict[str, Callable[[], Register]] = {
         "icp": lambda: jax.jit(icp(**_icp_fields(config.icp))),
+        "sac_ia": lambda: jax.jit(sac_ia(**_fields(config.sac_ia))),
         "sac_ia_icp": lambda: jax.jit(
             in_turn(sac_ia(**_fields(config.sac_ia)), icp(**_icp_fields(config.fine_icp)))
         ),

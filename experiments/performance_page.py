@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.marked_page import with_block
 from experiments.timing import shown
 from vanejax.whole_file import write_text
 
@@ -20,7 +21,6 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "performance.md"
 RESULTS = ROOT / "experiments" / "results"
 NAMES = "benchmark", "growth"
-BEGIN, END = "<!-- figures -->", "<!-- end of figures -->"
 
 
 def figures(report: Mapping[str, Any], growth: Mapping[str, Any]) -> str:
@@ -66,9 +66,7 @@ def _beside(entry: Mapping[str, Any]) -> str:
 
 def page(text: str, report: Mapping[str, Any], growth: Mapping[str, Any]) -> str:
     """The page with its figures replaced."""
-    before, _, rest = text.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    return f"{before}{BEGIN}\n{figures(report, growth)}\n{END}{after}"
+    return with_block(text, "figures", figures(report, growth))
 
 
 def recorded() -> tuple[dict[str, Any], dict[str, Any]]:

@@ -36,8 +36,8 @@ from vanejax.errors import InputError
 from vanejax.pairs import make_bank
 
 CAP_DEG = 20.0
-_DISTANCES = (0.05, 0.1, 0.2)
-_FEATURES = (0.25, 0.35, 0.5)
+_DISTANCES = (0.05, 0.1, 0.15)
+_FEATURES = (0.25, 0.3, 0.5)
 GRIDS: dict[str, dict[str, Sequence[Any]]] = {
     "icp": {
         "icp.metric": ("point_to_point", "point_to_plane"),
@@ -45,14 +45,18 @@ GRIDS: dict[str, dict[str, Sequence[Any]]] = {
         "icp.kernel": ("none", "huber"),
         "icp.trim": (1.0, 0.8),
     },
+    "sac_ia": {
+        "sac_ia.feature_radius": _FEATURES,
+        "sac_ia.max_distance": _DISTANCES,
+    },
     "sac_ia_icp": {
         "sac_ia.feature_radius": _FEATURES,
         "sac_ia.max_distance": _DISTANCES,
-        "fine_icp.max_distance": (0.05, 0.1),
+        "fine_icp.max_distance": (0.02, 0.05, 0.1),
     },
     "fgr": {
         "fgr.feature_radius": _FEATURES,
-        "fgr.max_distance": (0.025, *_DISTANCES),
+        "fgr.max_distance": (0.025, 0.05, 0.1),
         "fgr.tuple_similarity": (0.9, 0.95),
     },
     "open3d_icp": {
@@ -67,7 +71,7 @@ GRIDS: dict[str, dict[str, Sequence[Any]]] = {
     },
     "open3d_fgr": {
         "open3d_fgr.feature_radius": _FEATURES,
-        "open3d_fgr.max_distance": (0.025, *_DISTANCES),
+        "open3d_fgr.max_distance": (0.025, 0.05, 0.1),
         "open3d_fgr.tuple_similarity": (0.9, 0.95),
     },
 }

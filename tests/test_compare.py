@@ -138,7 +138,8 @@ def test_the_config_of_table_1_has_all_methods_with_their_settings() -> None:
     config = table1.get_config()
     config.check()
     assert config.methods == METHODS == tuple(TITLES)
-    assert set(TABLE_1) == {name for name in METHODS if not name.startswith("open3d")}
+    ours = {name for name in METHODS if not name.startswith("open3d")}
+    assert set(TABLE_1) == ours - {"sac_ia"}  # the paper has it with ICP only
     for name in METHODS:
         settings = settings_of(name, config)
         assert settings

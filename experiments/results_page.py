@@ -1,0 +1,178 @@
+"""Puts the recorded results of the comparisons into README.md and docs/comparison.md.
+
+python -m experiments.results_page
+
+Run it after copying comparison.json, tuning.json, public_vs_virtual.json, density.json or an
+ablation.json of a run to experiments/results (`NAMES` says under which name); a test checks that
+the pages are current.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from experiments import ablation_table, comparison_table, density_report, public_vs_virtual
+from experiments.marked_page import with_block
+from experiments.methods import TITLES
+from vanejax.whole_file import write_text
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "experiments" / "results"
+README, DETAILS = ROOT / "README.md", ROOT / "docs" / "comparison.md"
+NAMES = (
+    "vane",
+    "comparison",
+    "tuning",
+    "public_vs_virtual",
+    "density",
+    "ablation_neighbors",
+    "ablation_noise",
+)
+Report = Mapping[str, Any]
+
+
+def recorded() -> dict[str, Report]:
+    """What stands under experiments/results, by name."""
+    return {name: json.loads((RESULTS / f"{name}.json").read_text()) for name in NAMES}
+
+
+def made_by(report: Report) -> str:
+    """Machine, date and commit of a result, in a line."""
+    machine = report.get("machine", {})
+    cpu = machine.get("cpu") or machine.get("processor") or "an unknown processor"
+    commit = (report["commit"] or "unknown")[:10]
+    return f"{cpu}, {machine.get('cores')} cores; {report['date'][:10]}, commit {commit}."
+
+
+def vane_table(report: Report) -> str:
+    """The errors of the default recipe's network over the test views."""
+    measures = {
+        "rotation_error_deg": "rotation error (deg)",
+        "translation_error_mm": "translation error at the part's centre (mm)",
+        "ffmde_abs_mm": "FFMDE, absolute, eq. 2 (mm)",
+        "rmse_mm": "RMSE, eq. 1 (mm)",
+        "time_s": "time per registration (s)",
+    }
+    columns = ("mean", "median", "p95", "max")
+    lines = [
+        f"| {report['views']} test views | mean | median | 95 % | max |",
+        "|---|---|---|---|---|",
+    ]
+    for name, label in measures.items():
+        cells = " | ".join(f"{report['summary'][name][column]:.2f}" for column in columns)
+        lines.append(f"| {label} | {cells} |")
+    return "\n".join(lines)
+
+
+def brief_table(report: Report) -> str:
+    """Table 1 for the README: the paper's figures beside ours, the pose's errors first."""
+    lines = [
+        "| method | paper: RMSE, FFMDE (mm) | FFMDE (mm) | rotation (deg) | translation (mm) | "
+        "in need | refined: rotation (deg) | translation (mm) | in need | time (s) |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for method in report["methods"]:
+        if "skipped" in method:
+            continue
+        alone, refined, paper = method["alone"], method["refined"], method["paper"]
+        published = "" if paper is None else f"{paper['rmse_mm']:.2f}, {paper['ffmde_mm']:.2f}"
+        cells = [
+            method["title"],
+            published,
+            f"{alone['summary']['ffmde_abs_mm']['mean']:.2f}",
+            *_medians(alone),
+            f"{alone['success']:.0%}",
+            *_medians(refined),
+            f"{refined['success']:.0%}",
+            f"{alone['summary']['time_s']['median']:.2g}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _medians(stage: Report) -> list[str]:
+    """Median and p95 of both errors."""
+    errors = (stage["summary"][name] for name in ("rotation_error_deg", "translation_error_mm"))
+    return [f"{error['median']:.2g} ({error['p95']:.2g})" for error in errors]
+
+
+def tuning_table(report: Report) -> str:
+    """The best settings of each classical method."""
+    lines = [
+        f"Training views {', '.join(str(view) for view in report['training_views'])}; score: "
+        f"{report['score']}.",
+        "",
+        "| method | cells | score (deg) | median (deg, mm) | time (s) | best settings |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, found in report["methods"].items():
+        if "skipped" in found:
+            continue
+        best = found["best"]
+        settings = ", ".join(f"{path} = {value}" for path, value in best["values"].items())
+        lines.append(
+            f"| {TITLES[name]} | {len(found['cells'])} | {best['score_deg']:.3g} | "
+            f"{best['median_rotation_deg']:.3g}, {best['median_translation_mm']:.3g} | "
+            f"{best['time_s']:.2g} | {settings} |"
+        )
+    return "\n".join(lines)
+
+
+def text_block(text: str) -> str:
+    """Aligned text as Markdown shows it."""
+    return f"```text\n{text.rstrip()}\n```"
+
+
+def density_block(report: Report) -> str:
+    """What the study of densities found, then its figures."""
+    tables = "\n\n".join(density_report.table(sweep) for sweep in report["sweeps"])
+    return f"{report['verdict']}\n\n{text_block(tables)}"
+
+
+def blocks(results: Mapping[str, Report]) -> dict[Path, dict[str, str]]:
+    """Every generated block by page and name."""
+
+    def dated(name: str, body: Callable[[Report], str]) -> str:
+        return f"{body(results[name])}\n\n{made_by(results[name])}"
+
+    return {
+        README: {
+            "vane": vane_table(results["vane"]),
+            "table 1": brief_table(results["comparison"]),
+            "public": public_vs_virtual.table(results["public_vs_virtual"]),
+        },
+        DETAILS: {
+            "table 1": dated("comparison", comparison_table.table),
+            "tuning": dated("tuning", tuning_table),
+            "public": dated("public_vs_virtual", public_vs_virtual.table),
+            "density": dated("density", density_block),
+            "neighbors": dated(
+                "ablation_neighbors", lambda report: text_block(ablation_table.table(report))
+            ),
+            "noise": dated(
+                "ablation_noise", lambda report: text_block(ablation_table.table(report))
+            ),
+        },
+    }
+
+
+def page(path: Path, results: Mapping[str, Report]) -> str:
+    """A page with its blocks replaced."""
+    text = path.read_text()
+    for name, body in blocks(results)[path].items():
+        text = with_block(text, name, body)
+    return text
+
+
+def main() -> None:
+    """Rewrites both pages."""
+    results = recorded()
+    for path in (README, DETAILS):
+        write_text(path, page(path, results))
+
+
+if __name__ == "__main__":
+    main()
