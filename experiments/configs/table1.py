@@ -7,15 +7,26 @@ from experiments.configs import vane
 
 
 def get_config() -> Comparison:
-    """RPM-Net as in `vane.py`."""
+    """RPM-Net as in `vane.py`; the others' recipes fit a quarter of an hour each on two cores."""
     experiment = vane.get_config()
-    recipe = experiment.training
+    # half the published width, and the help that RPM-Net gets: the assignment is told the truth
+    experiment.dcp.width, experiment.dcp.hidden = 256, 512
+    experiment.dcp.matching = 0.1
+    # fewer iterations in training than at inference, for more pairs in the same time
+    experiment.pointnetlk.iterations = 5
+    experiment.pcrnet.iterations = 4
+    recipe = dataclasses.replace(experiment.training, quick_compilation=False)
     return Comparison(
         experiment=experiment,
         training=TrainingOfNetworks(
-            dcp=dataclasses.replace(recipe, steps=1500, learning_rate=1e-3),
-            pointnetlk=dataclasses.replace(recipe, steps=4000, learning_rate=1e-3),
-            pcrnet=dataclasses.replace(recipe, steps=8000, learning_rate=1e-3),
-            rpmnet=recipe,
+            dcp=dataclasses.replace(recipe, steps=1000, learning_rate=1e-3, evaluate_every=100),
+            pointnetlk=dataclasses.replace(
+                recipe, steps=1500, learning_rate=1e-3, batch_size=8, evaluate_every=100
+            ),
+            # its loss is flat for batches of 4
+            pcrnet=dataclasses.replace(
+                recipe, steps=1500, learning_rate=1e-3, batch_size=16, evaluate_every=100
+            ),
+            rpmnet=experiment.training,
         ),
     )
