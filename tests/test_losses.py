@@ -19,7 +19,9 @@ SIGMA = 0.3
 SOURCE_MASK, TARGET_MASK = np.arange(N) < 4, np.arange(M) != 2
 EXACT = 1e-12  # f64 eps x a sum of N x M terms
 LOSSES = {
-    "pose": lambda match, source, target, truth: losses.pose_loss(match, source, truth),
+    "pose": lambda match, source, target, truth: losses.pose_loss(
+        match.target_from_source, truth, source
+    ),
     "inlier": lambda match, source, target, truth: losses.inlier_loss(match, source, target),
     "matching": lambda *args: losses.matching_loss(*args, sigma=SIGMA),
     "partner": lambda match, source, target, truth: losses.partner_loss(match, source, truth),
@@ -139,10 +141,12 @@ def test_descending_the_gradient_of_the_affinities_lowers_it(name):
 def test_the_true_pose_costs_nothing_and_any_other_something():
     log_assignment, source, target, truth = problem()
     perfect = make_match(log_assignment, source, target, truth)
-    assert losses.pose_loss(perfect, source, truth) == 0
+    assert losses.pose_loss(perfect.target_from_source, truth, source) == 0
     shift = RigidTransform(np.eye(3), np.array([0.3, -0.6, 0.0]))
     off = make_match(log_assignment, source, target, shift @ truth)
-    np.testing.assert_allclose(losses.pose_loss(off, source, truth), 0.3, atol=EXACT)
+    np.testing.assert_allclose(
+        losses.pose_loss(off.target_from_source, truth, source), 0.3, atol=EXACT
+    )
 
 
 def test_a_full_assignment_leaves_no_slack_and_an_empty_one_all():

@@ -11,6 +11,7 @@ import optax
 import pytest
 from scipy.spatial.transform import Rotation
 
+from vanejax import losses
 from vanejax.models.pcrnet import PcrNet
 from vanejax.models.pointnetlk import PointNetLK
 from vanejax.pairs import Drawing, Pair, draw_pose
@@ -20,7 +21,6 @@ from vanejax.pointnet_losses import (
     PointNetLKLoss,
     chamfer_loss,
     matrix_loss,
-    pose_loss,
 )
 from vanejax.rigid import RigidTransform
 
@@ -107,9 +107,9 @@ def test_pose_loss_is_the_formula_over_real_points():
         for pose in (found, truth)
     )
     expected = np.mean(np.abs(np.subtract(*moved)))
-    np.testing.assert_allclose(pose_loss(found, truth, cloud(xyz, 20)), expected, rtol=1e-5)
-    assert pose_loss(truth, truth, cloud(xyz, 20)) == 0
-    assert pose_loss(found, truth, cloud(xyz, 0)) == 0
+    np.testing.assert_allclose(losses.pose_loss(found, truth, cloud(xyz, 20)), expected, rtol=1e-5)
+    assert losses.pose_loss(truth, truth, cloud(xyz, 20)) == 0
+    assert losses.pose_loss(found, truth, cloud(xyz, 0)) == 0
 
 
 def test_chamfer_loss_goes_one_way_over_real_points():
@@ -142,7 +142,7 @@ def plain(name: str, weights: dict, pairs: Pair) -> tuple[jax.Array, dict]:
             if name == "PCRNet":
                 pose = one
                 parts = {
-                    "pose": pose_loss(pose, truth, source),
+                    "pose": losses.pose_loss(pose, truth, source),
                     "chamfer": chamfer_loss(pose, source, pairs.target),
                 }
             else:

@@ -296,7 +296,7 @@ def test_the_loss_discounts_early_iterations_and_shares_the_reference():
         for weight, size in ((0.16, 1), (0.4, 2), (1.0, 3)):
             match = make_match(source, target, size * twist)
             parts = [
-                2.0 * losses.pose_loss(match, source, true),
+                2.0 * losses.pose_loss(match.target_from_source, true, source),
                 0.3 * losses.inlier_loss(match, source, target),
                 0.5 * losses.matching_loss(match, source, target, true, sigma=0.2),
                 0.7 * losses.partner_loss(match, source, true),

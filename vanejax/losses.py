@@ -10,15 +10,14 @@ from vanejax.pointcloud import PointCloud, squared_distances
 from vanejax.rigid import RigidTransform
 
 
-def pose_loss(match: Match, source: PointCloud, target_from_source: RigidTransform) -> jax.Array:
-    """Mean absolute difference of coordinates between the source under the found and true motion.
+def pose_loss(found: RigidTransform, truth: RigidTransform, source: PointCloud) -> jax.Array:
+    """Mean absolute difference of coordinates between the source [N] under two motions.
 
     Source: RPM-Net, section 4.4 (L_reg). [] f32, unit-sphere units.
     """
-    found = match.target_from_source.apply(source.xyz)
-    true = target_from_source.apply(source.xyz)
+    gap = jnp.abs(found.apply(source.xyz) - truth.apply(source.xyz))
     mask = source.mask[:, None]
-    return jnp.sum(jnp.abs(found - true), where=mask) / (3 * jnp.maximum(jnp.sum(mask), 1))
+    return jnp.sum(gap, where=mask) / (3 * jnp.maximum(jnp.sum(mask), 1))
 
 
 def inlier_loss(match: Match, source: PointCloud, target: PointCloud) -> jax.Array:

@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from vanejax import losses
 from vanejax.accumulation import accumulate
 from vanejax.metrics import nearest_offsets, pose_metrics
 from vanejax.models.pcrnet import PcrNet
@@ -87,7 +88,7 @@ class PcrNetLoss:
     Attributes:
       iterations: of the network in training; 8 as published.
       discount: weight of an iteration relative to the next; 0 leaves the last alone.
-      pose: factor of `pose_loss`; 0 as published.
+      pose: factor of `losses.pose_loss`; 0 as published.
       chamfer: factor of `chamfer_loss`.
       pairs_at_once: see `PointNetLKLoss`.
     """
@@ -115,7 +116,7 @@ class PcrNetLoss:
             poses = model.apply(
                 variables, source, pairs.target, init, self.iterations, template=template
             )
-            parts = {"pose": jax.vmap(pose_loss, (0, None, None))(poses, truth, source)}
+            parts = {"pose": jax.vmap(losses.pose_loss, (0, None, None))(poses, truth, source)}
             if self.chamfer:
                 chamfer = jax.vmap(chamfer_loss, (0, None, None))
                 parts["chamfer"] = chamfer(poses, source, pairs.target)
@@ -131,16 +132,6 @@ def matrix_loss(found: RigidTransform, truth: RigidTransform) -> jax.Array:
     """
     rest = (found.inverse() @ truth).as_matrix()
     return jnp.sum((rest - jnp.eye(4, dtype=rest.dtype)) ** 2)
-
-
-def pose_loss(found: RigidTransform, truth: RigidTransform, source: PointCloud) -> jax.Array:
-    """Mean absolute difference of coordinates between the source [N] under two motions.
-
-    [] f32, unit-sphere units; what `losses.pose_loss` is to RPM-Net.
-    """
-    gap = jnp.abs(found.apply(source.xyz) - truth.apply(source.xyz))
-    mask = source.mask[:, None]
-    return jnp.sum(gap, where=mask) / (3 * jnp.maximum(jnp.sum(mask), 1))
 
 
 def chamfer_loss(found: RigidTransform, source: PointCloud, target: PointCloud) -> jax.Array:

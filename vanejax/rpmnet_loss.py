@@ -47,7 +47,7 @@ class RpmNetLoss:
     def of_match(self, match: Match, source: Any, pair: Pair) -> tuple[jax.Array, Metrics]:
         """Loss [] of one iteration for one pair, and its parts."""
         truth = pair.target_from_source
-        parts = {"pose": losses.pose_loss(match, source, truth)}
+        parts = {"pose": losses.pose_loss(match.target_from_source, truth, source)}
         parts["inlier"] = losses.inlier_loss(match, source, pair.target)
         if self.matching:
             parts["matching"] = losses.matching_loss(
