@@ -1,0 +1,303 @@
+"""Ablations: trains a network for every cell of a grid of settings, and compares their errors.
+
+python -m experiments.ablate --config vane.py --sweep model.num_neighbors=8,16,32,64
+    [--sweep data.noise=0,0.01] [--seeds 0,1,2] [--cell_minutes=10] [--workdir runs/ablation]
+    [--config.FIELD=VALUE ...] [--cells]
+
+Any field of the config can be swept; several sweeps make a grid; tuples stand in brackets. Every
+cell registers the test views twice: under its own settings, and under the data, views, part and
+seed of the config, the same test for all. Kill it and give the command again: finished cells are
+kept, the one that was interrupted goes on. Results: a table, cells.jsonl (a line for each cell),
+ablation.json and ablation.png in the work folder.
+
+VANEJAX_CACHE_DIR is where compiled programs are kept (~/.cache/vanejax); off keeps none.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import datetime
+import hashlib
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from absl import flags
+
+from experiments import ablation_picture, command_line, study
+from experiments.ablation_table import CELL_TESTS, over_seeds, table
+from experiments.evaluate import registered, report_of
+from experiments.experiment import Experiment
+from experiments.machine import cores, cpu_model
+from experiments.report import plain
+from experiments.run_folder import RunFolder, git_commit, training_record, versions, write_text
+from experiments.sweep import Cell, Sweep, grid, parse_seeds, parse_sweeps
+from experiments.train import Interrupted, TrainingDiverged, load_or_scan
+from experiments.trained import trained
+from vanejax.dataset import ScanSet, describe_source
+from vanejax.errors import InputError
+from vanejax.part import Part
+from vanejax.plotting.canvas import save_figure
+from vanejax.training import Variables
+
+MEASURES = (
+    "rotation_error_deg",
+    "translation_error_mm",
+    "rmse_mm",
+    "ffmde_signed_mm",
+    "ffmde_abs_mm",
+)
+
+
+class SharedScans:
+    """Parts and their scans: made once for all the cells that need the same."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._parts: dict[tuple[str, str, float], Part] = {}
+
+    def part(self, config: Experiment) -> Part:
+        """The part of a cell."""
+        made_from = (config.part.path, config.part.units, config.views.resolution)
+        if made_from not in self._parts:
+            self._parts[made_from] = config.make_part()
+        return self._parts[made_from]
+
+    def path(self, config: Experiment) -> Path:
+        """Where the scans of a cell are: the same file where they are the same scans.
+
+        Raises:
+          InputError: viewpoints that cannot be made, or none to train on or to test.
+        """
+        part = self.part(config)
+        viewpoints = config.make_viewpoints(part)
+        trained_on = config.data.shapes or not viewpoints.is_test.all()
+        if not (trained_on and viewpoints.is_test.any()):
+            raise InputError(
+                f"config.views.azimuths_deg={config.views.azimuths_deg}: multiples of 40 deg are "
+                "tested, all others are trained on; both kinds are needed"
+            )
+        source = describe_source(part, config.make_camera(), viewpoints, config.data.voxel_mm)
+        digest = hashlib.sha256(json.dumps(source, sort_keys=True).encode()).hexdigest()
+        return self._folder / f"scans-{digest[:12]}.npz"
+
+    def scans(self, config: Experiment) -> ScanSet:
+        """The scans of a cell, from the file if another cell has made them."""
+        return load_or_scan(config, self.part(config), self.path(config))
+
+
+def ablate(
+    config: Experiment,
+    sweeps: Sequence[Sweep],
+    seeds: Sequence[int],
+    workdir: Path,
+    *,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Trains and tests every cell that is not finished yet, and reports on all.
+
+    Args:
+      config: what the cells change; the test that is the same for all is drawn as it says.
+      sweeps: fields and their values; the first is the axis of the picture.
+      seeds: every cell is trained with each.
+      workdir: receives the cells' runs, cells.jsonl, ablation.json and ablation.png.
+      progress: whether to show progress bars of the tests.
+
+    Returns:
+      What ablation.json holds.
+
+    Raises:
+      InputError: settings, parts or folders that cannot be used.
+      Interrupted: SIGINT or SIGTERM, after the state of the cell was saved.
+    """
+    cells = grid(sweeps, seeds)
+    shared = SharedScans(workdir)
+    for cell in cells:
+        settings = cell.config(config)
+        settings.check()
+        shared.path(settings)
+    config.check()
+    shared.path(config)
+    part = shared.part(config)
+    rows = []
+    with RunFolder(workdir) as folder:
+        folder.claim(config, part)
+        done = read_cells(workdir)
+        for number, cell in enumerate(cells, 1):
+            row = finished(cell, shared.part(cell.config(config)), done)
+            print(
+                f"cell {number} of {len(cells)}, {cell.name}: {'finished' if row else 'training'}"
+            )
+            if row is None:
+                row = run_cell(cell, config, shared, workdir, progress=progress)
+                done.append(row)
+                write_text(workdir / "cells.jsonl", "".join(json.dumps(r) + "\n" for r in done))
+            rows.append(row)
+    report = {
+        "name": config.name,
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "machine": {"cpu": cpu_model(), "cores": cores()},
+        "commit": git_commit(),
+        "versions": versions(),
+        "part": {"name": part.name, "sha256": part.sha256},
+        "config": dataclasses.asdict(config),
+        "sweeps": [dataclasses.asdict(sweep) for sweep in sweeps],
+        "seeds": list(seeds),
+        "points": over_seeds(rows),
+        "cells": [{name: row[name] for name in row if name != "config"} for row in rows],
+    }
+    report = study.save(workdir, "ablation", report)
+    save_figure(ablation_picture.picture(report), workdir / "ablation.png")
+    print(table(report))
+    return report
+
+
+def run_cell(
+    cell: Cell, base: Experiment, shared: SharedScans, workdir: Path, *, progress: bool = True
+) -> dict[str, Any]:
+    """Trains a cell and tests it; its line of cells.jsonl.
+
+    A training that diverges is a result, too: a line whose tests are None.
+
+    Raises:
+      Interrupted: SIGINT or SIGTERM; the cell goes on from its checkpoint.
+    """
+    config, folder = cell.config(base), workdir / "cells" / cell.name
+    part, scans = shared.part(config), shared.scans(config)
+    tests: dict[str, Any] = dict.fromkeys(CELL_TESTS)
+    try:
+        network = trained(config, part, scans, folder)
+    except TrainingDiverged as trouble:
+        print(f"{cell.name}: training diverged: {trouble}")
+        told = training_record(folder).summary(config.training.steps) | {"ended_by": "divergence"}
+    else:
+        told = network.record.summary(config.training.steps)
+        tests["own"] = errors_under(config, scans, network.variables, progress=progress)
+        same = same_test(config, base)
+        tests["same"] = tests["own"]
+        if same != config:
+            tests["same"] = errors_under(
+                same, shared.scans(same), network.variables, progress=progress
+            )
+    row = {
+        "cell": cell.name,
+        "overrides": dict(cell.overrides),
+        "seed": cell.seed,
+        "part": {"name": part.name, "sha256": part.sha256},
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "device": str(jax.devices()[0].device_kind),
+        "commit": git_commit(),
+        "versions": versions(),
+        "training": {name: told[name] for name in told if name != "curve"},
+        "tests": tests,
+        "config": dataclasses.asdict(config),
+    }
+    return plain(row)
+
+
+def same_test(config: Experiment, base: Experiment) -> Experiment:
+    """The cell's network under the base's data, views, part and seed."""
+    same = copy.deepcopy(config)
+    same.seed, same.part, same.views = base.seed, base.part, base.views
+    # shapes are what it was trained on, no matter of the test
+    same.data = dataclasses.replace(base.data, shapes=config.data.shapes)
+    return same
+
+
+def errors_under(
+    config: Experiment, scans: ScanSet, variables: Variables, *, progress: bool = True
+) -> dict[str, Any]:
+    """Summaries of the errors over the test views."""
+    report = report_of(config, scans, registered(config, scans, variables, progress=progress))
+    told = {name: report[name] for name in ("views", "non_finite_views")}
+    return told | {name: report["summary"][name] for name in MEASURES}
+
+
+def read_cells(workdir: Path) -> list[dict[str, Any]]:
+    """The lines of cells.jsonl; none where there is no such file.
+
+    Raises:
+      InputError: a line that cannot be read.
+    """
+    path = workdir / "cells.jsonl"
+    if not path.exists():
+        return []
+    try:
+        return [json.loads(line) for line in path.read_text().splitlines()]
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be read as lines of JSON ({error})") from error
+
+
+def finished(cell: Cell, part: Part, rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """The line of this very cell on this very part; None if there is none.
+
+    The rest of its config is the same for all lines: the work folder belongs to one config.
+    """
+    for row in rows:
+        if row["cell"] == cell.name and row["part"]["sha256"] == part.sha256:
+            return row
+    return None
+
+
+def list_cells(cells: Sequence[Cell], config: Experiment, workdir: Path) -> None:
+    """Prints what would be trained, and how long at most."""
+    names = {row["cell"] for row in read_cells(workdir)}
+    for cell in cells:
+        settings = cell.config(config).training
+        most = f", {settings.budget_minutes:g} min at most" if settings.budget_minutes else ""
+        told = "finished" if cell.name in names else f"{settings.steps} steps{most}"
+        print(f"{cell.name}: {told}")
+
+
+def main(config: Experiment, workdir: Path, sweeps: Sequence[Sweep], seeds: Sequence[int]) -> int:
+    """Runs the ablation; the exit code."""
+    try:
+        ablate(config, sweeps, seeds, workdir)
+    except Interrupted as stop:
+        print(f"{stop}; saved in {workdir}. Run the same command to go on.", file=sys.stderr)
+        return 128 + stop.signal
+    except KeyboardInterrupt:
+        print(
+            f"interrupted; {workdir} keeps what is done. Run the same command to go on.",
+            file=sys.stderr,
+        )
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    CONFIG = command_line.define_config()
+    WORKDIR = flags.DEFINE_string(
+        "workdir", None, "folder of the cells; runs/NAME-ablation with the config's name if none"
+    )
+    SWEEPS = flags.DEFINE_multi_string(
+        "sweep", [], "FIELD=VALUE,VALUE,... of the config; give it again for a grid"
+    )
+    SEEDS = flags.DEFINE_list("seeds", [], "every cell is trained with each; the config's if none")
+    MINUTES = flags.DEFINE_float(
+        "cell_minutes",
+        None,
+        "most minutes of training a cell, 0 for no limit; the config's budget_minutes if not given",
+        lower_bound=0.0,
+    )
+    CELLS = flags.DEFINE_bool("cells", False, "list the cells and train none")
+
+    def run() -> int:
+        """The command."""
+        config = CONFIG.value
+        sweeps, seeds = parse_sweeps(SWEEPS.value), parse_seeds(SEEDS.value, config.seed)
+        workdir = Path(WORKDIR.value or f"runs/{config.name}-ablation")
+        if MINUTES.value is not None:
+            if any(sweep.field == "training.budget_minutes" for sweep in sweeps):
+                raise InputError("--cell_minutes: training.budget_minutes is swept; give one")
+            config.training.budget_minutes = MINUTES.value
+        if CELLS.value:
+            list_cells(grid(sweeps, seeds), config, workdir)
+            return 0
+        return main(config, workdir, sweeps, seeds)
+
+    command_line.run(run)
