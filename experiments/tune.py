@@ -36,8 +36,8 @@ from vanejax.errors import InputError
 from vanejax.pairs import make_bank
 
 CAP_DEG = 20.0
-_DISTANCES = (0.05, 0.1, 0.15)
 _FEATURES = (0.25, 0.3, 0.5)
+_DISTANCES = (0.05, 0.1)
 GRIDS: dict[str, dict[str, Sequence[Any]]] = {
     "icp": {
         "icp.metric": ("point_to_point", "point_to_plane"),
@@ -45,20 +45,13 @@ GRIDS: dict[str, dict[str, Sequence[Any]]] = {
         "icp.kernel": ("none", "huber"),
         "icp.trim": (1.0, 0.8),
     },
-    "sac_ia": {
-        "sac_ia.feature_radius": _FEATURES,
-        "sac_ia.max_distance": _DISTANCES,
-    },
+    "sac_ia": {"sac_ia.feature_radius": _FEATURES, "sac_ia.max_distance": _DISTANCES},
     "sac_ia_icp": {
-        "sac_ia.feature_radius": _FEATURES,
         "sac_ia.max_distance": _DISTANCES,
-        "fine_icp.max_distance": (0.02, 0.05, 0.1),
+        "fine_icp.metric": ("point_to_point", "point_to_plane"),
+        "fine_icp.max_distance": (0.02, *_DISTANCES),
     },
-    "fgr": {
-        "fgr.feature_radius": _FEATURES,
-        "fgr.max_distance": (0.025, 0.05, 0.1),
-        "fgr.tuple_similarity": (0.9, 0.95),
-    },
+    "fgr": {"fgr.feature_radius": _FEATURES, "fgr.max_distance": (0.025, *_DISTANCES)},
     "open3d_icp": {
         "open3d_icp.metric": ("point_to_point", "point_to_plane"),
         "open3d_icp.max_distance": (0.2, 0.4, 0.8, 1.6),
@@ -67,11 +60,11 @@ GRIDS: dict[str, dict[str, Sequence[Any]]] = {
     "open3d_ransac_icp": {
         "open3d_ransac.feature_radius": _FEATURES,
         "open3d_ransac.max_distance": _DISTANCES,
-        "open3d_fine_icp.max_distance": (0.05, 0.1),
+        "open3d_fine_icp.max_distance": _DISTANCES,
     },
     "open3d_fgr": {
         "open3d_fgr.feature_radius": _FEATURES,
-        "open3d_fgr.max_distance": (0.025, 0.05, 0.1),
+        "open3d_fgr.max_distance": (0.025, *_DISTANCES),
         "open3d_fgr.tuple_similarity": (0.9, 0.95),
     },
 }
@@ -111,7 +104,7 @@ def tune(
       InputError: a method that has no grid, or no training views.
     """
     unknown = [name for name in methods if name not in GRIDS]
-    if unknown:
+    if unknown or not methods:
         raise InputError(f"methods {', '.join(unknown)}: only {', '.join(GRIDS)} are tuned")
     experiment = config.experiment
     part = experiment.make_part()
@@ -164,9 +157,9 @@ def tune(
         else:
             best = min(rows, key=lambda row: row["score_deg"])
             report["methods"][name] = {"best": best, "cells": rows}
-    report = study.save(workdir, "tuning", report)
-    print(table(report))
-    return report
+        saved = study.save(workdir, "tuning", report)  # what is found outlives a kill
+    print(table(saved))
+    return saved
 
 
 def table(report: Mapping[str, Any]) -> str:
