@@ -88,9 +88,7 @@ def registration_overlays(overlays: Sequence[Overlay]) -> Figure:
             color=INK,
             fontsize=10,
         )
-        rows[1, column].set_title(
-            _pose_error(overlay), color=INK, fontsize=10, fontweight="bold"
-        )
+        rows[1, column].set_title(_pose_error(overlay), color=INK, fontsize=10, fontweight="bold")
     for axes, name in zip(rows[:, 0], ("before", "after"), strict=True):
         axes.text(
             0.0, 0.5, name, transform=axes.transAxes, rotation=90, ha="right", va="center",
