@@ -118,18 +118,18 @@ def _parse(tree: type, argv: list[str]) -> list[str]:
     """Absl's parser, with overrides checked first so that a typo lists the right names."""
     for argument in argv[1:]:
         if match := _OVERRIDE.match(argument):
-            _check_field(tree, match.group(1))
+            check_field(tree, match.group(1))
     try:
         return flags.FLAGS(argv)
     except flags.IllegalFlagValueError as error:
         match = _OVERRIDE.search(str(error))
-        wanted = f"; it takes {_kind(tree, match.group(1))}" if match else ""
+        wanted = f"; it takes {kind_of(tree, match.group(1))}" if match else ""
         raise InputError(f"{error}{wanted}") from error
     except (flags.Error, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{error}; see --help") from error
 
 
-def _kind(tree: type, path: str) -> str:
+def kind_of(tree: type, path: str) -> str:
     """What a field holds, such as "an int, for example 32"."""
     value: Any = tree()
     for name in path.split("."):
@@ -138,7 +138,7 @@ def _kind(tree: type, path: str) -> str:
     return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}, for example {value!r}"
 
 
-def _check_field(tree: type, path: str) -> None:
+def check_field(tree: type, path: str) -> None:
     node: Any = tree()
     walked = "config"
     for name in path.split("."):

@@ -120,7 +120,7 @@ def _parse_sweep(word: str) -> Sweep:
     if field == "seed":
         raise InputError("--sweep seed: seeds have an option of their own, such as --seeds 0,1,2")
     try:
-        command_line._check_field(Experiment, field)
+        command_line.check_field(Experiment, field)
     except InputError as error:
         raise InputError(f"--sweep {str(error).removeprefix('--config.')}") from error
     kind = _type_of(field)
@@ -133,7 +133,7 @@ def _parse_sweep(word: str) -> Sweep:
         try:
             values.append(_parse_value(value, kind))
         except (ValueError, SyntaxError):
-            wanted = command_line._kind(Experiment, field)
+            wanted = command_line.kind_of(Experiment, field)
             raise InputError(f"--sweep {field}: {value!r} will not do; it takes {wanted}") from None
     _refuse_twice(f"--sweep {field}", values)
     return Sweep(field, tuple(values))

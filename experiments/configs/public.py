@@ -9,4 +9,7 @@ def get_config() -> Experiment:
     config = vane.get_config()
     config.name = "public"
     config.data.shapes = "solids"
+    config.training.steps = 1200  # what it learns from the part's scans, it has learned by then
+    config.training.quick_compilation = False
+    config.training.evaluate_every = 100
     return config
