@@ -139,6 +139,11 @@ def kind_of(tree: type, path: str) -> str:
 
 
 def check_field(tree: type, path: str) -> None:
+    """Refuses a path such as ``model.num_neighbors`` that names no field of the tree.
+
+    Raises:
+      InputError: names what is there, and what is near.
+    """
     node: Any = tree()
     walked = "config"
     for name in path.split("."):
