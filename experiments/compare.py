@@ -24,7 +24,7 @@ import numpy as np
 from absl import flags
 
 from experiments import command_line, comparison_pictures, study
-from experiments.comparison import NETWORKS, OPEN3D, Comparison
+from experiments.comparison import NETWORKS, Comparison
 from experiments.comparison_table import table
 from experiments.fine_step import FineStep
 from experiments.machine import cores, cpu_model, peer_versions
@@ -35,7 +35,7 @@ from experiments.run_folder import git_commit, versions
 from experiments.train import Interrupted, TrainingDiverged, load_or_scan
 from experiments.trained import Trained, given_runs, trained
 from vanejax.dataset import ScanSet
-from vanejax.errors import InputError
+from vanejax.errors import InputError, MissingExtra
 from vanejax.metrics import summary
 from vanejax.pairs import make_bank
 
@@ -94,9 +94,7 @@ def compare(
     for name in config.methods:
         try:
             register = make_method(name, config, networks.get(name))
-        except InputError as missing:
-            if name not in OPEN3D:
-                raise
+        except MissingExtra as missing:
             report["methods"].append({"name": name, "title": TITLES[name], "skipped": str(missing)})
             continue
         print(f"{TITLES[name]}: registering")

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vanejax.errors import InputError
+from vanejax.errors import InputError, MissingExtra
 from vanejax.pointcloud import PointCloud
 from vanejax.registration import Register, Registration
 from vanejax.rigid import RigidTransform
@@ -171,7 +171,7 @@ def _open3d() -> ModuleType:
     try:
         import open3d
     except ImportError as error:
-        raise InputError(
+        raise MissingExtra(
             f"Open3D needs the extra peers: pip install 'vanejax[peers]' ({error})"
         ) from error
     return open3d

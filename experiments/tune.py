@@ -32,7 +32,7 @@ from experiments.methods import TITLES, make_method
 from experiments.registrations import Results, register_views
 from experiments.run_folder import git_commit, versions
 from experiments.train import load_or_scan
-from vanejax.errors import InputError
+from vanejax.errors import InputError, MissingExtra
 from vanejax.pairs import make_bank
 
 CAP_DEG = 20.0
@@ -55,7 +55,6 @@ GRIDS: dict[str, dict[str, Sequence[Any]]] = {
     "open3d_icp": {
         "open3d_icp.metric": ("point_to_point", "point_to_plane"),
         "open3d_icp.max_distance": (0.2, 0.4, 0.8, 1.6),
-        "open3d_icp.kernel": ("none", "huber"),
     },
     "open3d_ransac_icp": {
         "open3d_ransac.feature_radius": _FEATURES,
@@ -132,9 +131,7 @@ def tune(
         for values in tqdm(grid, TITLES[name], unit="cell", disable=not progress):
             try:
                 register = make_method(name, with_values(config, values))
-            except InputError as missing:
-                if name not in OPEN3D:
-                    raise
+            except MissingExtra as missing:
                 report["methods"][name] = {"skipped": str(missing)}
                 break
             results = register_views(

@@ -16,7 +16,7 @@ from experiments.comparison_table import HEAD, table
 from experiments.configs import smoke, table1
 from experiments.methods import GROUPS, TABLE_1, TITLES, make_method, settings_of
 from experiments.trained import given_runs, trained
-from vanejax.errors import InputError
+from vanejax.errors import InputError, MissingExtra
 
 
 def small() -> Comparison:
@@ -121,7 +121,7 @@ def test_unknown_and_repeated_methods_are_refused() -> None:
 
 def test_a_missing_peer_is_a_line_and_no_failure(monkeypatch, tmp_path: Path) -> None:
     def missing(name: str, *_: object) -> None:
-        raise InputError("needs the extra peers")
+        raise MissingExtra("needs the extra peers")
 
     monkeypatch.setattr(command, "make_method", missing)
     config = small()
@@ -129,8 +129,10 @@ def test_a_missing_peer_is_a_line_and_no_failure(monkeypatch, tmp_path: Path) ->
     report = compare(config, tmp_path, {}, progress=False)
     assert report["methods"][0]["skipped"] == "needs the extra peers"
     assert "needs the extra peers" in table(report)
-    config.methods = ("icp",)
-    with pytest.raises(InputError, match="peers"):
+    config.open3d_icp.trim = 0.5  # what the method cannot do is no missing package
+    monkeypatch.undo()
+    pytest.importorskip("open3d", reason="needs the extra peers")
+    with pytest.raises(InputError, match="does not trim"):
         compare(config, tmp_path, {}, progress=False)
 
 

@@ -8,3 +8,7 @@ class InputError(ValueError):
 
     Command lines print the message alone, without a traceback, and exit with code 2.
     """
+
+
+class MissingExtra(InputError):
+    """An optional package that is not installed; the message names the extra to install."""

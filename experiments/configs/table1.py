@@ -2,7 +2,15 @@
 
 import dataclasses
 
-from experiments.comparison import Comparison, TrainingOfNetworks
+from experiments.comparison import (
+    Comparison,
+    FgrSettings,
+    IcpSettings,
+    Open3dFgrSettings,
+    Open3dRansacSettings,
+    SacIaSettings,
+    TrainingOfNetworks,
+)
 from experiments.configs import vane
 
 
@@ -29,4 +37,13 @@ def get_config() -> Comparison:
             ),
             rpmnet=experiment.training,
         ),
+        # the best of `experiments.tune`; experiments/results/tuning.json has every cell
+        icp=IcpSettings(metric="point_to_plane", max_distance=0.4),
+        sac_ia=SacIaSettings(feature_radius=0.25, max_distance=0.05),
+        fine_icp=IcpSettings(metric="point_to_point", max_distance=0.05),
+        fgr=FgrSettings(feature_radius=0.3, max_distance=0.1),
+        open3d_icp=IcpSettings(metric="point_to_plane", max_distance=0.4),
+        open3d_ransac=Open3dRansacSettings(feature_radius=0.5, max_distance=0.1),
+        open3d_fine_icp=IcpSettings(metric="point_to_plane", max_distance=0.1),
+        open3d_fgr=Open3dFgrSettings(feature_radius=0.3, max_distance=0.1, tuple_similarity=0.9),
     )
