@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from experiments.methods import TITLES
 from experiments.pictures import overlay
@@ -38,7 +39,7 @@ def draw(
 def error_shares(report: Mapping[str, Any]) -> Figure:
     """For each method the share of the views that err by less, before and after refinement."""
     figure = new_figure(12.0, 8.0)
-    panels = figure.subplots(2, 2, sharey=True)
+    panels = figure.subplots(2, 2, sharex="col", sharey=True)
     methods = [method for method in report["methods"] if "alone" in method]
     for row, (stage, words) in zip(panels, STAGES, strict=True):
         for axes, (name, label, need) in zip(row, ERRORS, strict=True):
@@ -47,8 +48,14 @@ def error_shares(report: Mapping[str, Any]) -> Figure:
                 _share(axes, method[stage][name], number, method["title"])
             axes.axvline(report["need"][need], color=FAINT, linewidth=1.0)
             axes.set_xscale("log")
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.tick_params(labelbottom=True)
             axes.set_ylim(0, 1.02)
-    panels[0, 0].legend(frameon=False, fontsize=9, labelcolor=INK, loc="upper left")
+    lines, titles = panels[0, 0].get_legend_handles_labels()
+    figure.legend(
+        lines, titles, loc="outside upper center", ncols=4, frameon=False, fontsize=9,
+        labelcolor=INK,
+    )  # fmt: skip
     return figure
 
 

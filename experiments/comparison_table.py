@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+PEERS = {"icp": "open3d_icp", "sac_ia_icp": "open3d_ransac_icp", "fgr": "open3d_fgr"}
+MOST_ERROR = 1.1
+
 HEAD = (
     "method",
     "paper: RMSE, FFMDE (mm), time (s)",
@@ -44,9 +47,34 @@ def table(report: Mapping[str, Any]) -> str:
             f"{floor['rmse_mm']['mean']:.3g} mm and an absolute FFMDE of "
             f"{floor['ffmde_abs_mm']['mean']:.3g} mm.",
         ]
+    lines += beside_open3d(report)
     trained = [method for method in report["methods"] if method.get("training")]
     lines += [""] + [_training(method) for method in trained]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def beside_open3d(report: Mapping[str, Any]) -> list[str]:
+    """How the classical methods stand to Open3D's on the same clouds, as ratios of medians.
+
+    The goal is an error of at most `MOST_ERROR` times Open3D's.
+    """
+    found = {method["name"]: method for method in report["methods"] if "alone" in method}
+    lines = []
+    for ours, theirs in PEERS.items():
+        if not {ours, theirs} <= set(found):
+            continue
+        one, other = (found[name]["alone"]["summary"] for name in (ours, theirs))
+        turn, shift, time = (
+            one[name]["median"] / other[name]["median"]
+            for name in ("rotation_error_deg", "translation_error_mm", "time_s")
+        )
+        met = "met" if max(turn, shift) <= MOST_ERROR else "MISSED"
+        lines.append(
+            f"- {found[ours]['title']} beside {found[theirs]['title']}: {turn:.2f} times its "
+            f"median rotation error, {shift:.2f} times its translation error "
+            f"(goal {MOST_ERROR:g}: {met}), {time:.1f} times its time."
+        )
+    return ["", *lines] if lines else []
 
 
 def _cells(method: Mapping[str, Any]) -> list[str]:

@@ -12,7 +12,7 @@ import pytest
 from experiments import compare as command
 from experiments.compare import compare, main
 from experiments.comparison import METHODS, Comparison
-from experiments.comparison_table import HEAD, table
+from experiments.comparison_table import HEAD, beside_open3d, table
 from experiments.configs import smoke, table1
 from experiments.methods import GROUPS, TABLE_1, TITLES, make_method, settings_of
 from experiments.trained import given_runs, trained
@@ -159,3 +159,18 @@ def test_methods_on_the_command_line_replace_the_configs(monkeypatch, tmp_path: 
     assert main(small(), tmp_path, ["fgr"], []) == 0
     assert main(small(), tmp_path, [], []) == 0
     assert seen == [("fgr",), ("icp", "pcrnet")]
+
+
+def test_the_classical_methods_stand_beside_open3ds(report: dict) -> None:
+    assert beside_open3d(report) == []  # nothing to stand beside
+    icp = report["methods"][0]
+    slower = json.loads(json.dumps(icp)) | {"name": "open3d_icp", "title": "Open3D ICP"}
+    figures = slower["alone"]["summary"]
+    figures["rotation_error_deg"]["median"] /= 1.2  # ours errs by 1.2 times as much
+    figures["time_s"]["median"] *= 2
+    line = beside_open3d({"methods": [icp, slower]})[1]
+    assert "1.20 times its median rotation error, 1.00 times" in line
+    assert "MISSED" in line
+    assert "0.5 times its time" in line
+    figures["rotation_error_deg"]["median"] *= 1.2
+    assert "goal 1.1: met" in beside_open3d({"methods": [icp, slower]})[1]

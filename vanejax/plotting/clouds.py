@@ -116,7 +116,7 @@ def method_overlays(overlays: Mapping[str, Overlay], *, columns: int = 4) -> Fig
     columns = min(columns, len(overlays))
     lines = -(-len(overlays) // columns)
     height = _COLUMN_IN * height_per_width(limit)
-    figure = new_figure(_COLUMN_IN * columns + 0.3, (height + 0.5) * lines + 0.6)
+    figure = new_figure(_COLUMN_IN * columns + 0.3, (height + 0.4) * lines + 0.3)
     panels = figure.subplots(lines, columns, squeeze=False)
     for axes in panels.flat[len(overlays) :]:
         axes.set_axis_off()
