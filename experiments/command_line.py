@@ -39,13 +39,19 @@ def define_config() -> flags.FlagHolder:
 def define_workdir() -> flags.FlagHolder:
     """Defines ``--workdir``; see `workdir` for its default."""
     return flags.DEFINE_string(
-        "workdir", None, "folder of the run; runs/NAME with the config's name if not given"
+        "workdir",
+        None,
+        "folder of the run; if not given, runs/NAME with the config's name, and -NETWORK where "
+        "another network than RPM-Net is trained",
     )
 
 
 def workdir(given: flags.FlagHolder, config: flags.FlagHolder) -> Path:
     """The folder of the run."""
-    return Path(given.value or f"runs/{config.value.name}")
+    settings = config.value
+    network = settings.model.name if isinstance(settings, Experiment) else "rpmnet"
+    name = settings.name if network == "rpmnet" else f"{settings.name}-{network}"
+    return Path(given.value or f"runs/{name}")
 
 
 def run(main: Callable[[], int | None], *, tree: type = Experiment) -> None:

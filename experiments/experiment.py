@@ -184,14 +184,9 @@ class Experiment:
         """The network to train, by ``model.name``.
 
         Raises:
-          InputError: there is no network of this name.
+          InputError: there is no network of this name, or its settings cannot be.
         """
-        makers: dict[str, Callable[[], Network]] = {
-            "rpmnet": lambda: rpmnet_network(self.model, self.loss),
-            "dcp": lambda: dcp_network(self.dcp),
-            "pointnetlk": lambda: pointnetlk_network(self.pointnetlk),
-            "pcrnet": lambda: pcrnet_network(self.pcrnet),
-        }
+        makers = self._makers()
         if self.model.name not in makers:
             near = difflib.get_close_matches(self.model.name, makers, 1)
             hint = f"; did you mean {near[0]}?" if near else ""
@@ -200,6 +195,14 @@ class Experiment:
                 f"(the names are {', '.join(makers)})"
             )
         return makers[self.model.name]()
+
+    def _makers(self) -> dict[str, Callable[[], Network]]:
+        return {
+            "rpmnet": lambda: rpmnet_network(self.model, self.loss),
+            "dcp": lambda: dcp_network(self.dcp),
+            "pointnetlk": lambda: pointnetlk_network(self.pointnetlk),
+            "pcrnet": lambda: pcrnet_network(self.pcrnet),
+        }
 
     def make_optimizer(self) -> optax.GradientTransformation:
         """Adam with its schedule."""
@@ -251,6 +254,8 @@ class Experiment:
                     if not (np.isfinite(value) and (value >= 0 if least else value > 0)):
                         raise InputError(f"config.{group}.{name}={value!r} must be {words}")
         self.make_network()
+        for make in self._makers().values():
+            make()  # a setting that is not used is not wrong silently
         if self.model.feature_width % 8:
             raise InputError(
                 f"config.model.feature_width={self.model.feature_width} must be a multiple of 8, "

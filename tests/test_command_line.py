@@ -4,13 +4,20 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from experiments.command_line import resolve_config
+from experiments.command_line import resolve_config, workdir
+from experiments.configs import smoke, table1
 from vanejax.errors import InputError
 
 ROOT = Path(__file__).parents[1]
+
+
+def value(content: object) -> SimpleNamespace:
+    """What a flag holds."""
+    return SimpleNamespace(value=content)
 
 
 def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -33,7 +40,7 @@ def test_a_bare_name_is_found_here_first_and_then_in_the_package(tmp_path, monke
 
 
 def test_an_unknown_config_lists_those_there_are() -> None:
-    with pytest.raises(InputError, match=r"paper\.py, smoke\.py, vane\.py"):
+    with pytest.raises(InputError, match=r"paper\.py, public\.py, smoke\.py, table1\.py, vane\.py"):
         resolve_config(["train", "--config", "vain.py"])
     with pytest.raises(InputError, match="--config needs a file"):
         resolve_config(["train", "--config"])
@@ -57,6 +64,16 @@ def test_an_unknown_config_lists_those_there_are() -> None:
         (["--config", "smoke.py", "--config.data.noise=-1"], ["config.data.noise=-1.0", ">= 0"]),
         (["--config", "smoke.py", "--config.part.path=none.stl"], ["none.stl"]),
         (["--config", "smoke.py", "stray"], ["stray"]),
+        (
+            ["--config", "smoke.py", "--config.model.name=pointnet"],
+            ["config.model.name='pointnet'", "did you mean pointnetlk?", "dcp", "pcrnet"],
+        ),
+        (["--config", "smoke.py", "--config.dcp.heads=3"], ["dcp.width=512", "dcp.heads=3"]),
+        (
+            ["--config", "smoke.py", "--config.pointnetlk.origin=mean"],
+            ["pointnetlk.origin='mean'", "means, target"],
+        ),
+        (["--config", "table1.py"], ["of the kind Comparison", "takes Experiment"]),
     ],
 )
 def test_a_wrong_command_line_is_one_clear_error(
@@ -67,6 +84,15 @@ def test_a_wrong_command_line_is_one_clear_error(
     assert "Traceback" not in done.stderr
     for word in words:
         assert word in done.stderr
+
+
+def test_another_network_has_a_folder_of_its_own() -> None:
+    config = smoke.get_config()
+    assert workdir(value(None), value(config)) == Path("runs/smoke")
+    config.model.name = "dcp"
+    assert workdir(value(None), value(config)) == Path("runs/smoke-dcp")
+    assert workdir(value("here"), value(config)) == Path("here")
+    assert workdir(value(None), value(table1.get_config())) == Path("runs/table1")
 
 
 def test_help_names_the_config_and_the_workdir() -> None:
