@@ -158,3 +158,16 @@ def test_evaluating_again_gives_the_same_figures(unbroken: Path, environment) ->
     assert done.returncode == 0, done.stderr
     again = json.loads((unbroken / "evaluation.json").read_text())
     assert again["summary"]["rotation_error_deg"] == first["summary"]["rotation_error_deg"]
+
+
+def test_a_budget_ends_a_run_for_good(tmp_path, environment) -> None:
+    workdir = tmp_path / "short"
+    for _ in range(2):  # the second time nothing is left to do
+        code, text = finish(workdir, environment, "--config.training.budget_minutes=0.001")
+        assert code == 0, text
+        told = json.loads((workdir / "evaluation.json").read_text())["training"]
+        assert told["ended_by"] == "budget"
+        assert told["steps"] == 1
+        assert told["wanted_steps"] == STEPS
+        assert len(told["curve"]) == 1  # what was reached is validated
+    assert arrays_of(workdir, 1)
