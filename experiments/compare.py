@@ -150,7 +150,7 @@ def figures(results: Results, scans: ScanSet) -> dict[str, Any]:
 
 def training_told(network: Trained | None) -> dict[str, Any] | None:
     """How a network was trained, without its curve; None where there is none."""
-    if network is None:
+    if network is None or network.record is None:
         return None
     told = network.record.summary(network.config.training.steps)
     model = network.config.make_network().model

@@ -49,7 +49,7 @@ def table(report: Mapping[str, Any]) -> str:
         ]
     lines += beside_open3d(report)
     trained = [method for method in report["methods"] if method.get("training")]
-    lines += [""] + [_training(method) for method in trained]
+    lines += [""] + [training_line(method["title"], method["training"]) for method in trained]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -101,9 +101,8 @@ def _cells(method: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _training(method: Mapping[str, Any]) -> str:
+def training_line(title: str, told: Mapping[str, Any]) -> str:
     """How long a network was trained, and whether its curve is flat."""
-    told = method["training"]
     steps = f"{told['steps']:,} steps"
     if told["ended_by"] == "budget":
         steps = f"{steps} of {told['wanted_steps']:,}, ended by its budget of time"
@@ -114,7 +113,7 @@ def _training(method: Mapping[str, Any]) -> str:
             f"validation error {'fell by' if fall >= 0 else 'rose by'} {abs(fall):.0%} in the last "
             f"quarter: {'flat' if told['flat'] else 'not flat yet'}"
         )
-    return f"- {method['title']}: {steps}, {told['hours']:.2f} h; {curve}."
+    return f"- {title}: {steps}, {told['hours']:.2f} h; {curve}."
 
 
 def _spread(figures: Mapping[str, float]) -> str:

@@ -2,10 +2,12 @@
 
 python -m experiments.public_vs_virtual --config public.py [--workdir runs/public]
     [--config.data.shapes=PATH] [--trained virtual=runs/vane] [--config.FIELD=VALUE ...]
+    [--trained public=partial-trained.pth]
 
 Both have the same network, loss, optimizer and number of steps; only what they see differs. Both
 register the same 54 test views of the part. ``data.shapes`` is where ModelNet40 is, a file of
-shapes, or "solids" for a procedural family of solids.
+shapes, or "solids" for a procedural family of solids. A checkpoint of the published PyTorch code
+may stand in for the network trained on public shapes.
 
 VANEJAX_CACHE_DIR is where compiled programs are kept (~/.cache/vanejax); off keeps none.
 """
@@ -25,6 +27,7 @@ from absl import flags
 
 from experiments import command_line, study
 from experiments.compare import figures, training_told
+from experiments.comparison_table import training_line
 from experiments.evaluate import registered
 from experiments.experiment import Experiment
 from experiments.machine import cores, cpu_model
@@ -81,7 +84,11 @@ def public_vs_virtual(
         folder = runs.get(name, workdir / name)
         network = trained(settings, part, scans, workdir / name, runs.get(name))
         shapes = folder / "shapes.json"
-        told = read_json(shapes) if shapes.exists() else {"title": "virtual scans of the part"}
+        told = {"title": "virtual scans of the part"}
+        if folder.is_file():
+            told = {"title": f"whatever {folder.name} was trained on"}
+        elif shapes.exists():
+            told = read_json(shapes)
         sources[name] = told | {"training": training_told(network)}
         results[name] = registered(settings, scans, network.variables, progress=progress)
     report = {
@@ -173,6 +180,8 @@ def table(report: Mapping[str, Any]) -> str:
             f"(rotation {fall['rotation']:.0%}, translation {fall['translation']:.0%}); the paper "
             f"says about {fall['paper']:.0%}.",
         ]
+    trained_on = [told for told in report["trained_on"].values() if told["training"]]
+    lines += ["", *(training_line(told["title"], told["training"]) for told in trained_on)]
     return "\n".join(lines)
 
 
@@ -193,6 +202,9 @@ if __name__ == "__main__":
     CONFIG = command_line.define_config()
     WORKDIR = command_line.define_workdir()
     RUNS = flags.DEFINE_multi_string(
-        "trained", [], "NAME=FOLDER: public or virtual from a finished run instead of training it"
+        "trained",
+        [],
+        "NAME=PATH: public or virtual from a finished run, or from a file of PyTorch weights, "
+        "instead of training it",
     )
     command_line.run(lambda: main(CONFIG.value, command_line.workdir(WORKDIR, CONFIG), RUNS.value))

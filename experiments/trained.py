@@ -14,7 +14,9 @@ from experiments.train import fit
 from experiments.training_record import TrainingRecord
 from vanejax.dataset import ScanSet
 from vanejax.errors import InputError
+from vanejax.models.rpmnet import variables_from_torch
 from vanejax.part import Part
+from vanejax.torch_weights import load_state_dict
 from vanejax.training import Variables
 
 
@@ -25,18 +27,24 @@ class Trained:
     Attributes:
       variables: averaged weights of the last step.
       config: of the run.
-      record: of its training.
+      record: of its training; None where only the weights are known.
     """
 
     variables: Variables
     config: Experiment
-    record: TrainingRecord
+    record: TrainingRecord | None
 
 
 def trained(
     config: Experiment, part: Part, scans: ScanSet, folder: Path, given: Path | None = None
 ) -> Trained:
-    """Trains in ``folder``, going on where a run there was interrupted; or loads a ``given`` run.
+    """Trains in ``folder``, going on where a run there was interrupted; or loads what is ``given``.
+
+    Args:
+      config: the network, and how it is trained.
+      part, scans: what for.
+      folder: of a run to begin, to go on with, or that is finished.
+      given: the folder of another run, or a file of RPM-Net's weights from PyTorch.
 
     Raises:
       InputError: the given folder holds a run of another network, part or kind of data.
@@ -47,6 +55,10 @@ def trained(
             run.claim(config, part)
             variables = fit(config, scans, run).average
         return Trained(variables, config, training_record(folder))
+    if given.is_file():
+        if config.model.name != "rpmnet":
+            raise InputError(f"{given}: weights from PyTorch are read for an RPM-Net only")
+        return Trained(variables_from_torch(load_state_dict(given)), config, None)
     record = read_json(given / "run.json")
     mine = json.loads(json.dumps(dataclasses.asdict(config)))
     theirs = record.get("config", {})
@@ -72,17 +84,17 @@ def trained(
 
 
 def given_runs(words: Iterable[str], names: Iterable[str]) -> dict[str, Path]:
-    """Folders by network from ``NAME=FOLDER`` arguments.
+    """Folders, or files of weights, by network from ``NAME=PATH`` arguments.
 
     Raises:
-      InputError: no such network or folder, or an argument of another form.
+      InputError: no such network or path, or an argument of another form.
     """
     runs: dict[str, Path] = {}
     for word in words:
         name, equals, folder = word.partition("=")
         if not equals or name not in names:
-            raise InputError(f"--trained {word}: should be NAME=FOLDER with {', '.join(names)}")
-        if not Path(folder).is_dir():
-            raise InputError(f"--trained {word}: there is no folder {folder}")
+            raise InputError(f"--trained {word}: should be NAME=PATH with {', '.join(names)}")
+        if not Path(folder).exists():
+            raise InputError(f"--trained {word}: there is no {folder}")
         runs[name] = Path(folder)
     return runs

@@ -100,9 +100,9 @@ def test_a_run_of_something_else_is_refused(report: dict, folder: Path) -> None:
 def test_given_runs_are_checked(tmp_path: Path) -> None:
     assert given_runs([f"dcp={tmp_path}"], ("dcp",)) == {"dcp": tmp_path}
     for word, message in (
-        ("dcp", "NAME=FOLDER"),
-        (f"icp={tmp_path}", "NAME=FOLDER with dcp"),
-        ("dcp=/no/such", "no folder /no/such"),
+        ("dcp", "NAME=PATH"),
+        (f"icp={tmp_path}", "NAME=PATH with dcp"),
+        ("dcp=/no/such", "there is no /no/such"),
     ):
         with pytest.raises(InputError, match=message):
             given_runs([word], ("dcp",))

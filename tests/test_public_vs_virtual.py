@@ -11,6 +11,7 @@ import pytest
 from experiments.configs import public, smoke, vane
 from experiments.experiment import Experiment
 from experiments.public_vs_virtual import of_virtual_scans, public_vs_virtual, table
+from experiments.trained import trained
 from vanejax.errors import InputError
 
 
@@ -88,3 +89,15 @@ def test_a_run_begun_with_other_shapes_is_refused(report: dict, folder: Path) ->
     config.data.shapes = "solids:5"
     with pytest.raises(InputError, match=r"data\.shapes was 'solids:6', now 'solids:5'"):
         public_vs_virtual(config, folder, {"virtual": folder / "virtual"}, progress=False)
+
+
+def test_a_checkpoint_of_pytorch_is_read_for_an_rpmnet_only(tmp_path: Path) -> None:
+    weights = tmp_path / "weights.npz"
+    np.savez(weights, unknown=np.zeros(3, np.float32))
+    config = small()
+    part = config.make_part()
+    with pytest.raises(InputError, match="for an RPM-Net only"):
+        trained(config, part, None, tmp_path / "x", weights)
+    config.model.name = "rpmnet"
+    with pytest.raises(InputError, match="not a published RPM-Net's"):
+        trained(config, part, None, tmp_path / "x", weights)
