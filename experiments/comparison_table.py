@@ -16,11 +16,11 @@ HEAD = (
     "RMSE (mm)",
     "rotation error (deg)",
     "translation error (mm)",
-    "in need",
+    "within need",
     "time (s)",
     "refined: rotation (deg)",
     "translation (mm)",
-    "in need",
+    "within need",
 )
 
 
@@ -29,7 +29,7 @@ def table(report: Mapping[str, Any]) -> str:
     need = report["need"]
     lines = [
         f"{report['views']} test views of the {report['part']['name']}; mean / median / 95 %. "
-        f"In need: within {need['rotation_deg']:g} deg and {need['translation_mm']:g} mm.",
+        f"Within need: within {need['rotation_deg']:g} deg and {need['translation_mm']:g} mm.",
         "",
         "| " + " | ".join(HEAD) + " |",
         "|" + "---|" * len(HEAD),

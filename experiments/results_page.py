@@ -71,7 +71,7 @@ def brief_table(report: Report) -> str:
     """Table 1 for the README: the paper's figures beside ours, the pose's errors first."""
     lines = [
         "| method | paper: RMSE, FFMDE (mm) | FFMDE (mm) | rotation (deg) | translation (mm) | "
-        "in need | refined: rotation (deg) | translation (mm) | in need | time (s) |",
+        "within need | refined: rotation (deg) | translation (mm) | within need | time (s) |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for method in report["methods"]:
@@ -96,7 +96,12 @@ def brief_table(report: Report) -> str:
 def _medians(stage: Report) -> list[str]:
     """Median and p95 of both errors."""
     errors = (stage["summary"][name] for name in ("rotation_error_deg", "translation_error_mm"))
-    return [f"{error['median']:.2g} ({error['p95']:.2g})" for error in errors]
+    return [f"{_short(error['median'])} ({_short(error['p95'])})" for error in errors]
+
+
+def _short(value: float) -> str:
+    """Two digits, or the whole number."""
+    return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
 
 
 def tuning_table(report: Report) -> str:
