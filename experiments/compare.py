@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,7 @@ from experiments.methods import TABLE_1, TITLES, make_method, settings_of
 from experiments.registrations import Results, register_views
 from experiments.report import hardest_views, summarize
 from experiments.run_folder import git_commit, versions
-from experiments.train import Interrupted, TrainingDiverged, load_or_scan
+from experiments.train import exit_code, load_or_scan
 from experiments.trained import Trained, given_runs, trained
 from vanejax.dataset import ScanSet
 from vanejax.errors import InputError, MissingExtra
@@ -171,15 +170,8 @@ def main(config: Comparison, workdir: Path, methods: list[str], words: list[str]
     """Compares; the exit code."""
     if methods:
         config.methods = tuple(methods)
-    try:
-        compare(config, workdir, given_runs(words, NETWORKS))
-    except Interrupted as stop:
-        print(f"{stop}; saved in {workdir}. Run the same command to go on.", file=sys.stderr)
-        return 128 + stop.signal
-    except TrainingDiverged as trouble:
-        print(f"error: training stopped: {trouble}", file=sys.stderr)
-        return 1
-    return 0
+    runs = given_runs(words, NETWORKS)
+    return exit_code(lambda: compare(config, workdir, runs), workdir)
 
 
 if __name__ == "__main__":

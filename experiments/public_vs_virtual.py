@@ -17,7 +17,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import datetime
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,7 @@ from experiments.machine import cores, cpu_model
 from experiments.registrations import Results
 from experiments.report import hardest_views
 from experiments.run_folder import git_commit, read_json, versions
-from experiments.train import Interrupted, TrainingDiverged, load_or_scan
+from experiments.train import exit_code, load_or_scan
 from experiments.trained import given_runs, trained
 from vanejax import plotting
 from vanejax.dataset import ScanSet
@@ -187,15 +186,8 @@ def table(report: Mapping[str, Any]) -> str:
 
 def main(config: Experiment, workdir: Path, words: list[str]) -> int:
     """Compares; the exit code."""
-    try:
-        public_vs_virtual(config, workdir, given_runs(words, (PUBLIC, VIRTUAL)))
-    except Interrupted as stop:
-        print(f"{stop}; saved in {workdir}. Run the same command to go on.", file=sys.stderr)
-        return 128 + stop.signal
-    except TrainingDiverged as trouble:
-        print(f"error: training stopped: {trouble}", file=sys.stderr)
-        return 1
-    return 0
+    runs = given_runs(words, (PUBLIC, VIRTUAL))
+    return exit_code(lambda: public_vs_virtual(config, workdir, runs), workdir)
 
 
 if __name__ == "__main__":

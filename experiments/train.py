@@ -279,21 +279,26 @@ def stop_signal() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def main(config: Experiment, workdir: Path) -> int:
-    """Trains, evaluates and reports; the exit code."""
+def exit_code(work: Callable[[], object], workdir: Path) -> int:
+    """Does work that trains in ``workdir``; 0, or what its early end means, said in one line."""
     try:
-        train(config, workdir)
+        work()
     except Interrupted as stop:
         print(f"{stop}; saved in {workdir}. Run the same command to go on.", file=sys.stderr)
         return 128 + stop.signal
     except TrainingDiverged as trouble:
         print(
             f"error: training stopped: {trouble}. The last good checkpoint is kept in {workdir}. "
-            "Try a lower --config.training.learning_rate with another --workdir.",
+            "Try a lower learning_rate in config.training, with another --workdir.",
             file=sys.stderr,
         )
         return 1
     return 0
+
+
+def main(config: Experiment, workdir: Path) -> int:
+    """Trains, evaluates and reports; the exit code."""
+    return exit_code(lambda: train(config, workdir), workdir)
 
 
 if __name__ == "__main__":
