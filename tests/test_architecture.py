@@ -67,6 +67,7 @@ LAYERS = [
     "classical.sac_ia",
     "classical.fgr",
     "models.layers",
+    "models.iteration",
     "models.rpmnet",
     "models.pointnet",
     "models.pointnetlk",
@@ -121,6 +122,7 @@ LAYERS = [
 SHARED = {
     "classical.feature_matches",
     "models.layers",
+    "models.iteration",
     "models.pointnet",
     "models.dgcnn",
     "models.transformer",

@@ -6,6 +6,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from vanejax.features import fpfh
 from vanejax.pointcloud import PointCloud
 
 _EXACT = jax.lax.Precision.HIGHEST
@@ -58,6 +59,12 @@ def feature_distances(
     squared = jnp.sum(a**2, -1)[:, None] + jnp.sum(b**2, -1)[None, :]
     squared = squared - 2 * jnp.matmul(a, b.T, precision=_EXACT)
     return jnp.where(source_mask[:, None] & target_mask[None, :], squared, _FAR)
+
+
+def fpfh_distances(source: PointCloud, target: PointCloud, *, radius: float) -> jax.Array:
+    """[N, M] `feature_distances` of two clouds' FPFH of this radius, in the clouds' unit."""
+    features = (fpfh(cloud, radius=radius) for cloud in (source, target))
+    return feature_distances(*features, source.mask, target.mask)
 
 
 def nearest_matches(distances: jax.Array, *, num_candidates: int, mutual: bool) -> Matches:

@@ -12,10 +12,9 @@ import jax.numpy as jnp
 from vanejax.classical.feature_matches import (
     Matches,
     draw_triangles,
-    feature_distances,
+    fpfh_distances,
     nearest_matches,
 )
-from vanejax.features import fpfh
 from vanejax.pointcloud import PointCloud
 from vanejax.registration import Register, Registration
 from vanejax.rigid import RigidTransform, exp_so3, hat, weighted_procrustes
@@ -74,12 +73,7 @@ def sac_ia(
     def register(
         source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
     ) -> Registration:
-        distances = feature_distances(
-            fpfh(source, radius=feature_radius),
-            fpfh(target, radius=feature_radius),
-            source.mask,
-            target.mask,
-        )
+        distances = fpfh_distances(source, target, radius=feature_radius)
         matches = nearest_matches(distances, num_candidates=num_candidates, mutual=False)
         triangles = draw_triangles(
             key,

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from vanejax.models.dgcnn import Dgcnn
+from vanejax.models.iteration import last_iteration
 from vanejax.models.transformer import Encoded, Transformer
 from vanejax.pointcloud import PointCloud
 from vanejax.registration import Register, Registration
@@ -147,7 +148,7 @@ def last_match(
     iterations: int,
     target_embedding: Embedding | None = None,
 ) -> Match:
-    """The last of several iterations: a loop, not as many copies of the network to compile.
+    """The last of several iterations; see `last_iteration`.
 
     Args:
       model, variables: the network and its weights.
@@ -163,14 +164,7 @@ def last_match(
     def match(pose: RigidTransform) -> Match:
         return model.apply(variables, source, target, target_embedding, pose, method="match")
 
-    def step(before: Match, _: None) -> tuple[Match, None]:
-        return match(before.target_from_source), None
-
-    start = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(match, init)
-    )
-    start = start.replace(target_from_source=jax.tree.map(jnp.asarray, init))
-    return jax.lax.scan(step, start, length=iterations)[0]
+    return last_iteration(match, init, iterations=iterations)
 
 
 def dcp(model: Dcp, variables: Mapping[str, Any], *, iterations: int = 1) -> Register:

@@ -23,6 +23,7 @@ import numpy as np
 from vanejax.errors import InputError
 from vanejax.features import point_pair_features
 from vanejax.matching import log_sinkhorn, soft_correspondences
+from vanejax.models.iteration import last_iteration
 from vanejax.models.layers import (
     DenseNormRelu,
     DenseNormReluCloudMax,
@@ -234,7 +235,7 @@ def last_match(
     near: jax.Array | None = None,
     target_features: jax.Array | None = None,
 ) -> Match:
-    """The last of several iterations: a loop, not as many copies of the network to compile.
+    """The last of several iterations; see `last_iteration`.
 
     Args:
       model, variables: the network and its weights.
@@ -255,14 +256,7 @@ def last_match(
             variables, source, near, target, target_features, pose, method=RpmNet.match
         )
 
-    def step(before: Match, _: None) -> tuple[Match, None]:
-        return match(before.target_from_source), None
-
-    start = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(match, init)
-    )
-    start = start.replace(target_from_source=jax.tree.map(jnp.asarray, init))
-    return jax.lax.scan(step, start, length=iterations)[0]
+    return last_iteration(match, init, iterations=iterations)
 
 
 def rpmnet(model: RpmNet, variables: Mapping[str, Any], *, iterations: int = 5) -> Register:
