@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 
 from experiments import compare as command
-from experiments.compare import compare, main
+from experiments.compare import compare, figures, main
 from experiments.comparison import METHODS, Comparison
 from experiments.comparison_table import HEAD, beside_open3d, table
 from experiments.configs import smoke, table1
 from experiments.methods import GROUPS, TABLE_1, TITLES, make_method, settings_of
+from experiments.registrations import register_views
 from experiments.trained import given_runs, trained
+from vanejax.classical.icp import icp
+from vanejax.dataset import make_scan_set
 from vanejax.errors import InputError, MissingExtra
+from vanejax.pairs import make_bank
 
 
 def small() -> Comparison:
@@ -63,6 +67,18 @@ def test_every_method_is_compared_alone_and_refined(report: dict, folder: Path) 
     assert json.loads((folder / "comparison.json").read_text()) == report
     for name in ("errors.png", "methods.png"):
         assert (folder / name).stat().st_size > 10_000
+
+
+def test_the_fine_step_leaves_a_pose_in_the_frame_it_came_in(report: dict) -> None:
+    """Rotation and translation alike: the noise of 0.7 mm on the points moves neither by 3 mm."""
+    icp_figures = report["methods"][0]
+    near = np.array(icp_figures["alone"]["rotation_error_deg"]) < 20
+    turned, moved = (
+        np.array(icp_figures["refined"][name])[near]
+        for name in ("rotation_error_deg", "translation_error_mm")
+    )
+    assert np.median(turned) < 3
+    assert np.median(moved) < 3
 
 
 def test_the_table_has_the_papers_figures_beside_ours(report: dict, folder: Path) -> None:
@@ -174,3 +190,45 @@ def test_the_classical_methods_stand_beside_open3ds(report: dict) -> None:
     assert "0.5 times its time" in line
     figures["rotation_error_deg"]["median"] *= 1.2
     assert "goal 1.1: met" in beside_open3d({"methods": [icp, slower]})[1]
+
+
+def test_success_needs_both_errors_and_what_is_not_finite_is_none(report: dict) -> None:
+    """Counted anew from the pose errors of each view, with errors that are made to differ."""
+    config = small()
+    experiment = config.experiment
+    scans = make_scan_set(
+        experiment.make_part(),
+        experiment.make_camera(),
+        experiment.make_viewpoints(experiment.make_part()),
+        voxel_mm=experiment.data.voxel_mm,
+        progress=False,
+    )
+    still = icp(max_distance=1e-6, max_iterations=1)  # finds nothing: the identity
+    results = register_views(
+        still,
+        make_bank(scans.test, num_reference=experiment.data.num_reference),
+        experiment.make_drawing(scans),
+        seed=0,
+        unit_mm=scans.radius_mm,
+        progress=False,
+    )
+    rotation = np.array([0.49, 0.49, 0.51, np.nan])
+    translation = np.array([0.99, 1.01, 0.99, 0.1])
+    changed = results.errors.replace(rotation_deg=rotation, translation_mm=translation)
+    told = figures(results.replace(errors=changed), scans.test)
+    assert told["success"] == 0.25  # the first alone
+    assert told["turned_over"] == 0.25  # an answer that is none counts as turned over
+    assert told["non_finite_views"] == 1
+    assert told["converged"] == 0
+    turned = results.errors.replace(rotation_deg=np.array([1.0, 91.0, 89.0, 180.0]))
+    assert figures(results.replace(errors=turned), scans.test)["turned_over"] == 0.5
+
+
+def test_a_given_run_tells_how_it_was_trained_itself(report: dict, folder: Path) -> None:
+    config = small()
+    config.methods = ("pcrnet",)
+    config.training.pcrnet.steps = 99  # of a training that is not done here
+    told = compare(config, folder / "told", {"pcrnet": folder / "pcrnet"}, progress=False)
+    training = told["methods"][0]["training"]
+    assert (training["steps"], training["wanted_steps"]) == (2, 2)
+    assert training["ended_by"] == "steps"

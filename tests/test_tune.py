@@ -14,7 +14,9 @@ from experiments.comparison import Comparison
 from experiments.configs import smoke
 from experiments.methods import GROUPS
 from experiments.tune import CAP_DEG, GRIDS, cells, score_deg, tune, with_values
+from vanejax.dataset import load_scan_set
 from vanejax.errors import InputError
+from vanejax.pairs import make_bank
 
 
 def small() -> Comparison:
@@ -68,6 +70,27 @@ def test_the_best_cell_wins_on_training_views_alone(monkeypatch, tmp_path: Path,
     assert report["training_views"] == [0, 2, 5]
     assert json.loads((tmp_path / "tuning.json").read_text()) == report
     assert "--config.icp.max_distance=1.0" in capsys.readouterr().out
+
+
+def test_no_pair_is_drawn_from_a_test_view(monkeypatch, tmp_path: Path) -> None:
+    banks = []
+
+    def register_views(register, bank, drawing, **rest: object) -> SimpleNamespace:
+        banks.append(bank)
+        errors = SimpleNamespace(rotation_deg=np.ones(2), translation_mm=np.ones(2))
+        return SimpleNamespace(errors=errors, time_s=np.ones(2))
+
+    monkeypatch.setattr(command, "register_views", register_views)
+    monkeypatch.setattr(command, "GRIDS", {"icp": {"icp.max_distance": (1.0,)}})
+    config = small()
+    tune(config, tmp_path, ["icp"], 99, progress=False)
+    scans = load_scan_set(tmp_path / "scans.npz")
+    (bank,) = banks
+    wanted = make_bank(scans.train, num_reference=config.experiment.data.num_reference)
+    np.testing.assert_array_equal(bank.scans.xyz, wanted.scans.xyz)
+    unseen = make_bank(scans.test, num_reference=config.experiment.data.num_reference)
+    for view in unseen.scans.xyz:
+        assert not any(np.array_equal(view, used) for used in bank.scans.xyz)
 
 
 def test_a_method_without_a_grid_is_refused(tmp_path: Path) -> None:
