@@ -38,7 +38,7 @@ def draw(
         ),
         "axis_errors": plotting.axis_errors(
             {
-                "RPM-Net": plotting.AxisErrors(
+                "registration": plotting.AxisErrors(
                     rotation_deg=errors.rotation_axes_deg,
                     translation_mm=errors.translation_axes_mm,
                 )
