@@ -303,6 +303,44 @@ class Scanner:
         seen[inside] = (blocker < 0) & (np.abs(cosine) > EDGE_ON_COSINE)
         return camera_from_local.apply(points_local[~seen]).astype(np.float32)
 
+    def lit(
+        self,
+        points: np.ndarray,
+        normals: np.ndarray,
+        towards: np.ndarray,
+        camera_from_part: RigidTransform,
+    ) -> np.ndarray:
+        """Whether light reaches points on the surface.
+
+        Args:
+          points, normals: [N, 3] f32, camera frame, mm and unit, as a `Scan` has them.
+          towards: [N, 3] f32 mm, or [3] for parallel light, camera frame: from each point to the
+            light. What stands in between shades the point, on its own face too.
+          camera_from_part: of the scan.
+
+        Returns:
+          [N] bool.
+        """
+        rotation = np.asarray(camera_from_part.rotation, np.float64)
+        center = camera_from_part.apply(self._center)
+        lit = np.einsum("ni,ni->n" if towards.ndim == 2 else "ni,i->n", normals, towards) > 0
+        facing = np.flatnonzero(lit)
+        # leave the face by several float32 roundings, on the side of the light
+        lift = np.float32(3e-5 * self._radius)
+        starts = points.take(facing, axis=0) - center.astype(np.float32)
+        starts += lift * normals.take(facing, axis=0)
+        ways = towards.take(facing, axis=0) if towards.ndim == 2 else towards[None]
+        turn = rotation.astype(np.float32)
+        ways = np.broadcast_to(ways @ turn, starts.shape)
+        blocker = self._scene.run(
+            starts @ turn,
+            np.ascontiguousarray(ways),
+            dists=np.ones(len(facing), np.float32),
+            query="OCCLUDED",
+        )
+        lit[facing] = blocker < 0
+        return lit
+
     def _refuse_camera_inside(self, camera_from_local: RigidTransform) -> None:
         """Raises InputError for a camera inside the solid.
 
