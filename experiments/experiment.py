@@ -12,6 +12,7 @@ from dataclasses import field
 import numpy as np
 import optax
 
+from experiments.endless import EndlessSettings
 from experiments.networks import (
     DcpSettings,
     LossSettings,
@@ -134,6 +135,7 @@ class Experiment:
       name: of the run: the default work folder is ``runs/NAME``.
       seed: of everything random.
       model, loss: which network is trained, and RPM-Net's settings.
+      endless: new scans for every step, in place of the fixed ones.
       dcp, pointnetlk, pcrnet: settings of the networks of these names, loss and all.
     """
 
@@ -142,6 +144,7 @@ class Experiment:
     part: PartSettings = field(default_factory=PartSettings)
     views: ViewSettings = field(default_factory=ViewSettings)
     data: DataSettings = field(default_factory=DataSettings)
+    endless: EndlessSettings = field(default_factory=EndlessSettings)
     model: ModelSettings = field(default_factory=ModelSettings)
     loss: LossSettings = field(default_factory=LossSettings)
     dcp: DcpSettings = field(default_factory=DcpSettings)
@@ -253,6 +256,12 @@ class Experiment:
                     value = getattr(getattr(self, group), name)
                     if not (np.isfinite(value) and (value >= 0 if least else value > 0)):
                         raise InputError(f"config.{group}.{name}={value!r} must be {words}")
+        self.endless.check()
+        if self.endless.sensor and self.data.shapes:
+            raise InputError(
+                f"config.data.shapes={self.data.shapes!r} and config.endless.sensor="
+                f"{self.endless.sensor!r}: train on one of them"
+            )
         self.make_network()
         for make in self._makers().values():
             make()  # a setting that is not used is not wrong silently

@@ -26,14 +26,13 @@ from experiments import command_line
 from experiments.evaluate import evaluate
 from experiments.experiment import Experiment, TrainingSettings
 from experiments.run_folder import RunFolder, training_record
-from experiments.shape_sets import load_shapes
+from experiments.training_banks import training_banks
 from vanejax.checkpoint import Checkpoints, all_finite, restore_or
 from vanejax.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
 from vanejax.metrics import pose_metrics
-from vanejax.pairs import Bank, Drawing, make_bank
+from vanejax.pairs import Bank, Drawing
 from vanejax.part import Part
 from vanejax.rigid import RigidTransform
-from vanejax.shape_pairs import ShapeBank
 from vanejax.training import (
     Metrics,
     TrainState,
@@ -76,7 +75,7 @@ def train(config: Experiment, workdir: Path) -> None:
             print(f"{part.name}: {note}")
         folder.claim(config, part)
         scans = load_or_scan(config, part, folder.path / "scans.npz")
-        state = fit(config, scans, folder)
+        state = fit(config, part, scans, folder)
         evaluate(
             config, scans, state.average, workdir, part=part, training=training_record(workdir)
         )
@@ -94,11 +93,11 @@ def load_or_scan(config: Experiment, part: Part, path: Path) -> ScanSet:
     return scans
 
 
-def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
-    """Trains on the training views of ``scans``; the test views are not looked at."""
+def fit(config: Experiment, part: Part, scans: ScanSet, folder: RunFolder) -> TrainState:
+    """Trains; of ``scans``, only the training views are looked at."""
     settings = config.training
     network, optimizer = config.make_network(), config.make_optimizer()
-    drawing, bank = config.make_drawing(scans), training_bank(config, scans, folder)
+    drawing, banks = config.make_drawing(scans), training_banks(config, part, scans, folder)
     step = make_train_step(
         network.model,
         optimizer,
@@ -109,13 +108,14 @@ def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
         average_decay=settings.average_decay,
         quick_compilation=settings.quick_compilation,
     )
-    validate = make_validation(config, bank, drawing, scans.radius_mm)
-    state = init_state(network.model, optimizer, bank, drawing, seed=config.seed)
+    validate = make_validation(config, banks.validation, drawing, scans.radius_mm)
+    state = init_state(network.model, optimizer, banks.validation, drawing, seed=config.seed)
     state = restore_or(folder.checkpoints, state, keep=settings.keep)
 
     with (
         Checkpoints(folder.checkpoints, keep=settings.keep) as checkpoints,
         Log(folder, int(state.step), settings.steps, scans.radius_mm) as log,
+        banks.steps(int(state.step), settings.steps) as bank_of_step,
         stop_signal() as stop,
     ):
         began = time.monotonic() - folder.seconds
@@ -123,8 +123,11 @@ def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
         for done in range(int(state.step) + 1, settings.steps + 1):
             if over:
                 break
+            asked = time.perf_counter()
+            bank = next(bank_of_step)
+            waited = time.perf_counter() - asked
             state, metrics = step(state, bank)
-            log.add(metrics)
+            log.add(metrics | {"scan_wait_s": waited})
             leave = bool(stop)  # once: a signal may come between two looks
             over = over_budget(settings, time.monotonic() - began)
             last = over or done == settings.steps
@@ -140,16 +143,6 @@ def fit(config: Experiment, scans: ScanSet, folder: RunFolder) -> TrainState:
             if leave and not last:
                 raise Interrupted(stop[0], done)
     return state
-
-
-def training_bank(config: Experiment, scans: ScanSet, folder: RunFolder) -> Bank:
-    """What training pairs are drawn from: the training views, or generic shapes."""
-    if not config.data.shapes:
-        return make_bank(scans.train, num_reference=config.data.num_reference)
-    shapes = load_shapes(config.data.shapes, seed=config.seed)
-    folder.claim_shapes(shapes.title, shapes.sha256)
-    print(f"training on {shapes.title}")
-    return ShapeBank(points=jnp.asarray(shapes.points), normals=jnp.asarray(shapes.normals))
 
 
 def over_budget(settings: TrainingSettings, seconds: float) -> bool:

@@ -53,7 +53,7 @@ def trained(
     if given is None:
         with RunFolder(folder) as run:
             run.claim(config, part)
-            variables = fit(config, scans, run).average
+            variables = fit(config, part, scans, run).average
         return Trained(variables, config, training_record(folder))
     if given.is_file():
         if config.model.name != "rpmnet":

@@ -82,8 +82,10 @@ LAYERS = [
     "models.transformer",
     "models.dcp",
     # JAX: training
+    "normals",
     "pairs",
     "shape_pairs",
+    "scan_stream",
     "losses",
     "accumulation",
     "metrics",
@@ -93,7 +95,6 @@ LAYERS = [
     "dcp_loss",
     "checkpoint",
     # one scan, one part, one pose
-    "normals",
     "model_file",
     "model_export",
     "inspection",

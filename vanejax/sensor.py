@@ -18,7 +18,7 @@ import numpy as np
 
 from vanejax.camera import Camera
 from vanejax.errors import InputError
-from vanejax.exposure import Exposure
+from vanejax.exposure import REFERENCE_MM, Exposure
 from vanejax.range_errors import Lens, Trueness, jumps, mixed_disparity, smooth_field
 from vanejax.rigid_transform import RigidTransform
 from vanejax.scanner import Scan, Scanner
@@ -133,6 +133,20 @@ class Sensor:
             step_px=self.step_px * factors,
             lens=lens,
         )
+
+    def exposed_for(self, distance_mm: float) -> Sensor:
+        """The same with the exposure that a part at this distance needs.
+
+        An exposure that suits 400 mm is longer by the square of the distance: the projector's light
+        spreads.
+        """
+        if self.exposure is None:
+            return self
+        factor = (distance_mm / REFERENCE_MM) ** 2
+        exposure = dataclasses.replace(
+            self.exposure, exposure_ms=factor * self.exposure.exposure_ms
+        )
+        return dataclasses.replace(self, exposure=exposure)
 
     def another(self, rng: np.random.Generator, *, spread: float = 0.3) -> Sensor:
         """Another camera of this kind, as its maker's next one would be.

@@ -1,0 +1,343 @@
+"""Each effect of the sensor where physics says, and none where it is switched off."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import trimesh
+
+from vanejax.camera import Camera, hemisphere_viewpoints, look_at
+from vanejax.errors import InputError
+from vanejax.exposure import Exposure
+from vanejax.part import Part, part_from_mesh
+from vanejax.range_errors import Lens, Trueness
+from vanejax.scanner import Scanner
+from vanejax.sensor import PRESETS, Measurement, Reason, Sensor, measure, preset
+from vanejax.vane import guide_vane
+
+CAMERA = Camera(width=320, height=256, near_mm=100.0)
+ABOVE = look_at(np.array([0.0, 0.0, 400.0]), np.zeros(3))
+
+
+def solid(*bounds: tuple) -> Part:
+    mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=b) for b in bounds])
+    return part_from_mesh(mesh.vertices, mesh.faces, name="test")
+
+
+@pytest.fixture(scope="module")
+def plate() -> Scanner:
+    """A plate whose upper face is z = 0, 400 mm below the camera; no noise is absorbed by edges."""
+    return Scanner(solid(((-90, -60, -4), (90, 60, 0))))
+
+
+@pytest.fixture(scope="module")
+def vane() -> Scanner:
+    return Scanner(guide_vane())
+
+
+def take(scanner: Scanner, sensor: Sensor, *, seed: int = 0, pose=ABOVE) -> Measurement:
+    return measure(scanner, sensor, pose, np.random.default_rng(seed))
+
+
+def depth_error(scan: Measurement) -> np.ndarray:
+    """[n] mm, measured depth less the true one."""
+    return (scan.ideal.points[scan.kept, 2] - scan.points[:, 2]).astype(np.float64)
+
+
+def test_without_effects_the_scan_is_the_ideal_one_bit_for_bit(vane):
+    view = hemisphere_viewpoints(vane.part.center).view(50)
+    sensor = Sensor(camera=CAMERA)
+    ideal = vane.scan(CAMERA, view)
+    scan = take(vane, sensor, pose=view)
+    np.testing.assert_array_equal(scan.points, ideal.points)
+    np.testing.assert_array_equal(scan.reason, np.zeros(len(ideal.points), np.uint8))
+    np.testing.assert_array_equal(scan.range_mm, scan.clean_range_mm)
+    for name in ("face", "pixel", "normals"):
+        np.testing.assert_array_equal(getattr(scan, name), getattr(ideal, name))
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_is_deterministic_and_seeded(name, vane):
+    view = hemisphere_viewpoints(vane.part.center).view(50)
+    sensor = preset(name).scaled(0.25) if name != "consumer_depth" else preset(name)
+    one, same, other = (take(vane, sensor, seed=seed, pose=view) for seed in (4, 4, 5))
+    np.testing.assert_array_equal(one.points, same.points)
+    np.testing.assert_array_equal(one.reason, same.reason)
+    assert np.isfinite(one.points).all()
+    assert (one.points.shape == other.points.shape and (one.points == other.points).all()) == (
+        name == "ideal"
+    )
+
+
+def test_the_shadow_ends_where_the_projector_s_ray_over_the_edge_lands():
+    """A block 20 mm high ends at x = -20; the projector stands at x = +120 - or at -120."""
+    scanner = Scanner(solid(((-90, -60, -4), (90, 60, 0)), ((-40, -60, -1), (-20, 60, 20))))
+    for baseline, edge, inward in ((120.0, -40.0, -1), (-120.0, -20.0, 1)):
+        scan = take(scanner, Sensor(camera=CAMERA, baseline_mm=baseline, shadow=True))
+        points = ABOVE.inverse().apply(scan.ideal.points.astype(np.float64))
+        floor = np.abs(points[:, 2]) < 1e-3
+        dark = floor & (scan.reason == Reason.SHADOWED)
+        # from (baseline, 400) over (edge, 20) down to z = 0
+        lands = edge + (edge - baseline) * 20 / 380
+        low, high = sorted((edge, lands))
+        inside = floor & (points[:, 0] > low) & (points[:, 0] < high)
+        assert dark.sum() > 500
+        np.testing.assert_array_equal(dark, inside)
+        assert np.sign(lands - edge) == inward
+
+
+def test_faces_that_the_projector_sees_from_behind_are_dark():
+    """A wedge's face that leans away from the projector by more than it is aside."""
+    mesh = trimesh.convex.convex_hull(
+        [[-40, -30, 0], [-40, 30, 0], [40, -30, 0], [40, 30, 0], [38, -30, 60], [38, 30, 60]]
+    )
+    part = part_from_mesh(mesh.vertices, mesh.faces, name="wedge")
+    sensor = Sensor(camera=CAMERA, shadow=True, baseline_mm=600.0)
+    scan = take(Scanner(part), sensor)
+    slope = scan.ideal.normals[:, 0] < -0.3
+    assert slope.sum() > 1000
+    points = scan.ideal.points[slope].astype(np.float64)
+    light = np.array([600.0, 0, 0]) - points
+    behind = np.sum(light * scan.ideal.normals[slope], axis=1) < 0
+    assert behind.any()
+    assert (scan.reason[slope][behind] == Reason.SHADOWED).all()
+
+
+def test_dropout_begins_at_its_angle():
+    part = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
+    scanner = Scanner(part_from_mesh(part.vertices, part.faces, name="ball"))
+    scan = take(scanner, Sensor(camera=CAMERA, most_incidence_deg=60.0))
+    steep = scan.ideal.incidence_deg > 60.0
+    clear = np.abs(scan.ideal.incidence_deg - 60.0) > 1e-3
+    assert steep.sum() > 1000
+    np.testing.assert_array_equal((scan.reason == Reason.GRAZING)[clear], steep[clear])
+
+
+def test_strong_light_makes_holes_and_short_exposure_makes_dark(plate):
+    def shares(exposure: Exposure) -> tuple[float, float]:
+        scan = take(plate, Sensor(camera=CAMERA, exposure=exposure))
+        return (
+            float(np.mean(scan.reason == Reason.SATURATED)),
+            float(np.mean(scan.reason == Reason.DARK)),
+        )
+
+    good = Exposure(exposure_ms=10.0)
+    assert shares(good) == (0.0, 0.0)
+    assert shares(dataclasses.replace(good, exposure_ms=0.3)) == (0.0, 1.0)
+    assert shares(dataclasses.replace(good, exposure_ms=60.0)) == (1.0, 0.0)
+    # a lamp that the middle of the plate mirrors into the camera
+    lamp = Exposure(
+        projector_per_ms=1e-6,
+        least_modulation=0.0,
+        ambient_per_ms=0.01,
+        ambient_towards=(0, 0, 1),
+        specular=0.5,
+        roughness=0.03,
+    )
+    saturated, _ = shares(lamp)
+    assert 0.005 < saturated < 0.6
+    scan = take(plate, Sensor(camera=CAMERA, exposure=lamp))
+    hole = scan.ideal.points[scan.reason == Reason.SATURATED][:, :2]
+    rest = scan.ideal.points[scan.reason == Reason.MEASURED][:, :2]
+    assert np.linalg.norm(hole, axis=1).max() < np.linalg.norm(rest, axis=1).max() / 2
+    assert np.linalg.norm(hole.mean(axis=0)) < 3
+
+
+def test_more_light_never_measures_what_was_too_bright(vane):
+    view = hemisphere_viewpoints(vane.part.center).view(30)
+    holes = [
+        take(
+            vane,
+            Sensor(camera=CAMERA, exposure=Exposure(exposure_ms=ms, least_modulation=0.0)),
+            pose=view,
+        ).reason
+        == Reason.SATURATED
+        for ms in (10, 20, 40, 80)
+    ]
+    for less, more in itertools.pairwise(holes):
+        assert (more | ~less).all()
+        assert more.sum() > less.sum()
+
+
+def test_noise_has_the_variance_of_triangulation():
+    """sigma_z = z^2 / (f b) sigma_d, at two depths."""
+    for z in (300.0, 600.0):
+        scanner = Scanner(solid(((-90, -60, -4), (90, 60, 0))))
+        pose = look_at(np.array([0.0, 0.0, z]), np.zeros(3))
+        sensor = Sensor(camera=CAMERA, baseline_mm=100.0, noise_px=0.05)
+        errors = np.concatenate(
+            [depth_error(take(scanner, sensor, seed=seed, pose=pose)) for seed in range(3)]
+        )
+        sigma = z**2 / (CAMERA.fx * 100.0) * 0.05
+        assert sensor.range_sigma_mm(z) == pytest.approx(sigma)
+        # n values: the relative error of a standard deviation is 1 / sqrt(2 n)
+        np.testing.assert_allclose(errors.std(), sigma, rtol=4 / np.sqrt(2 * len(errors)) + 1e-3)
+        np.testing.assert_allclose(errors.mean(), 0, atol=4 * sigma / np.sqrt(len(errors)) + 1e-4)
+
+
+def test_correlated_noise_is_smooth_white_noise_is_not(plate):
+    def neighbor_correlation(sensor: Sensor) -> float:
+        scan = take(plate, sensor)
+        beside = np.diff(scan.pixel) == 1
+        error = depth_error(scan)
+        return float(np.corrcoef(error[:-1][beside], error[1:][beside])[0, 1])
+
+    base = Sensor(camera=CAMERA)
+    smooth = dataclasses.replace(base, correlated_px=0.05, correlation_px=10.0)
+    assert neighbor_correlation(smooth) > 0.98
+    assert abs(neighbor_correlation(dataclasses.replace(base, noise_px=0.05))) < 0.03
+
+
+def test_errors_lie_along_the_pixel_s_ray(plate):
+    scan = take(plate, Sensor(camera=CAMERA, noise_px=0.2, mixed_share=1.0, outlier_share=0.01))
+    true = scan.ideal.points[scan.kept]
+    np.testing.assert_allclose(np.cross(true, scan.points) / 400**2, 0, atol=3e-7)  # f32 eps, twice
+
+
+def test_mixed_pixels_lie_at_depth_edges_between_both_surfaces():
+    scanner = Scanner(solid(((-90, -60, -4), (90, 60, 0)), ((-20, -20, -1), (20, 20, 30))))
+    scan = take(scanner, Sensor(camera=CAMERA, mixed_share=1.0, jump_mm=5.0))
+    error = depth_error(scan)
+    moved = np.abs(error) > 1e-3
+    assert 100 < moved.sum() < 0.05 * len(error)
+    height = ABOVE.inverse().apply(scan.points.astype(np.float64))[moved, 2]
+    assert (height > -0.01).all()
+    assert (height < 30.01).all()
+    organised = scan.organised()
+    row, column = np.divmod(scan.pixel[moved], CAMERA.width)
+    depth = np.pad(organised["clean_range_mm"], 1, constant_values=np.nan)
+    for r, c in zip(row, column, strict=True):
+        around = depth[r : r + 3, c : c + 3]
+        assert np.nanmax(around) - np.nanmin(around) > 5
+
+
+def test_steps_of_depth_and_of_disparity(plate):
+    scan = take(plate, Sensor(camera=CAMERA, noise_px=0.3, step_mm=0.5))
+    steps = -scan.points[:, 2] / 0.5
+    np.testing.assert_allclose(steps, np.round(steps), atol=2e-4)
+    sensor = Sensor(camera=CAMERA, noise_px=0.3, step_px=0.125)
+    disparity = sensor.focal_baseline / -take(plate, sensor).points[:, 2].astype(np.float64) / 0.125
+    np.testing.assert_allclose(disparity, np.round(disparity), atol=1e-3)
+    assert len(np.unique(np.round(disparity))) > 5
+
+
+def test_a_focal_error_scales_across_the_axis_only(plate):
+    scan = take(plate, Sensor(camera=CAMERA, lens=Lens(focal_error=0.01)))
+    ideal = scan.ideal.points
+    np.testing.assert_allclose(scan.points[:, :2], 1.01 * ideal[:, :2], rtol=1e-5, atol=1e-4)
+    np.testing.assert_array_equal(scan.points[:, 2], ideal[:, 2])
+
+
+def test_trueness_biases_and_does_not_scatter(plate):
+    scan = take(plate, Sensor(camera=CAMERA, trueness=Trueness(scale=1e-3)))
+    np.testing.assert_allclose(depth_error(scan), 0.4, atol=5e-4)
+    bent = take(plate, Sensor(camera=CAMERA, trueness=Trueness(bend_mm=(0.5, 0.0))))
+    x = CAMERA.project(bent.ideal.points[:, :])[:, 0] / (CAMERA.width / 2) - 1
+    np.testing.assert_allclose(depth_error(bent), 0.5 * x**2, atol=1e-3)
+
+
+def test_outliers_and_lost_pixels_have_their_shares(plate):
+    scan = take(plate, Sensor(camera=CAMERA, outlier_share=0.05, outlier_mm=10.0, lost_share=0.1))
+    error = np.abs(depth_error(scan))
+    count = len(scan.reason)
+    # binomial: 4 standard deviations
+    assert abs(np.mean(scan.reason == Reason.LOST) - 0.1) < 4 * np.sqrt(0.09 / count)
+    assert abs(np.mean(error > 1e-2) - 0.05) < 4 * np.sqrt(0.0475 / count) + 1e-3
+    assert error.max() < 10.01
+    assert error.max() > 9
+
+
+def test_what_is_measured_outside_the_clip_planes_is_dropped(plate):
+    near = dataclasses.replace(CAMERA, near_mm=399.0)
+    scan = take(plate, Sensor(camera=near, outlier_share=0.5, outlier_mm=50.0))
+    assert np.mean(scan.reason == Reason.OUT_OF_RANGE) > 0.15
+    assert (-scan.points[:, 2] >= 399.0).all()
+
+
+def test_organised_arrays_hold_the_packed_ones(vane):
+    view = hemisphere_viewpoints(vane.part.center).view(80)
+    scan = take(vane, preset("paper_camera").scaled(0.2), pose=view)
+    images = scan.organised()
+    camera = scan.sensor.camera
+    for name, image in images.items():
+        assert image.shape[:2] == (camera.height, camera.width), name
+    there = np.isfinite(images["range_mm"])
+    np.testing.assert_array_equal(np.flatnonzero(there), scan.pixel)
+    np.testing.assert_array_equal(images["points"][there], scan.points)
+    np.testing.assert_array_equal(images["face"][there], scan.face)
+    np.testing.assert_array_equal(images["clean_range_mm"][there], scan.clean_range_mm)
+    reasons = np.bincount(images["reason"].ravel(), minlength=8)
+    assert reasons[Reason.NOTHING] == camera.width * camera.height - len(scan.reason)
+    assert reasons[Reason.MEASURED] == len(scan.points)
+    assert 0 < scan.hole_share < 1
+    assert len(scan.normals) == len(scan.points)
+
+
+def test_the_paper_s_camera_keeps_the_accuracy_of_its_table():
+    """0.1 mm at 300 and 1 mm at 1300 mm, read as a bound on 95 % of the errors; not far below."""
+    for z, bound in ((300.0, 0.1), (1300.0, 1.0)):
+        half = z / 8
+        scanner = Scanner(solid(((-half, -half, -4), (half, half, 0))))
+        pose = look_at(np.array([0.0, 0.0, z]), np.zeros(3))
+        sensor = dataclasses.replace(preset("paper_camera"), mixed_share=0.0, outlier_share=0.0)
+        errors = []
+        for seed in range(8):
+            rng = np.random.default_rng(seed)
+            scan = measure(scanner, sensor.another(rng).exposed_for(z), pose, rng)
+            assert len(scan.points), f"nothing is measured at {z} mm"
+            errors.append(np.quantile(np.abs(depth_error(scan)), 0.95))
+        assert 0.3 * bound < np.median(errors) <= bound
+
+
+def test_another_camera_of_a_kind_differs_and_keeps_its_switches():
+    rng = np.random.default_rng(0)
+    kind = preset("paper_camera")
+    made = [kind.another(rng) for _ in range(200)]
+    scales = np.array([sensor.trueness.scale for sensor in made])
+    np.testing.assert_allclose(scales.std(), kind.trueness.scale, rtol=0.2)
+    noise = np.log([sensor.noise_px / kind.noise_px for sensor in made])
+    np.testing.assert_allclose(noise.std(), 0.3, rtol=0.2)
+    assert all(sensor.shadow and sensor.camera == kind.camera for sensor in made)
+    assert dataclasses.replace(Sensor().another(rng), correlation_px=16.0) == Sensor()
+
+
+def test_exposure_follows_the_distance():
+    """Twice as far away a matte surface is as bright when it is exposed four times as long."""
+    sensor = preset("paper_camera")
+    near, far = sensor.exposed_for(400.0), sensor.exposed_for(800.0)
+    assert near == sensor
+    assert far.exposure.exposure_ms == pytest.approx(4 * near.exposure.exposure_ms)
+    assert Sensor().exposed_for(800.0) == Sensor()
+
+
+def test_fewer_pixels_leave_the_errors_in_mm(plate):
+    sensor = dataclasses.replace(preset("paper_camera"), exposure=None)
+    for factor in (0.25, 0.5):
+        small = sensor.scaled(factor)
+        assert small.camera.width == sensor.camera.width * factor
+        assert small.range_sigma_mm(400.0) == pytest.approx(sensor.range_sigma_mm(400.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("baseline_mm", 0.0),
+        ("most_incidence_deg", 91.0),
+        ("noise_px", -1.0),
+        ("correlation_px", 0.5),
+        ("mixed_share", 1.5),
+        ("outlier_share", float("nan")),
+        ("step_mm", float("inf")),
+    ],
+)
+def test_a_sensor_that_cannot_be_is_refused(name, value):
+    with pytest.raises(InputError, match=name):
+        dataclasses.replace(Sensor(), **{name: value})
+
+
+def test_an_unknown_preset_is_answered_with_the_known_ones():
+    with pytest.raises(InputError, match="ideal, paper_camera, consumer_depth"):
+        preset("hawk")
