@@ -77,6 +77,9 @@ class Refinement:
       num_inliers: of them, those with a weight.
       information: [6, 6], J^T W J of the last step: the inverse of `Uncertainty.covariance`, in
         the same coordinates.
+      allowance_mm: the uniform offset of the surface along its outward normals, where one was
+        estimated: a casting's stock; else 0.
+      allowance_sigma_mm: its standard deviation, the pose not being known either; else 0.
     """
 
     part_from_camera: RigidTransform
@@ -87,6 +90,8 @@ class Refinement:
     num_points: int
     num_inliers: int
     information: np.ndarray
+    allowance_mm: float = 0.0
+    allowance_sigma_mm: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -12,9 +12,10 @@ import dataclasses
 import numpy as np
 
 from vanejax.covariance import inflation, patches_of
+from vanejax.errors import InputError
 from vanejax.noise import LEAST_COSINE, Noise, fit_noise, weights
 from vanejax.pose_result import Refinement
-from vanejax.residuals import MeasurementModel, Precision, RayCasting, moved
+from vanejax.residuals import MeasurementModel, Precision, RayCasting, Residuals, moved
 from vanejax.rigid_transform import RigidTransform
 
 COARSE_POINTS = 4_000
@@ -97,8 +98,14 @@ def refine(
     *,
     max_iterations: int = 12,
     seed: int = 0,
+    max_allowance_mm: float = 0.0,
 ) -> Refinement:
     """One pose to the limit of what the scan's noise lets one know.
+
+    A casting has stock all over that its CAD model lacks: least squares then moves the part towards
+    the sensor. With ``max_allowance_mm`` a uniform offset along the outward normals is estimated as
+    a seventh unknown, and the pose's information is what is left when the offset is not known
+    (the Schur complement).
 
     Args:
       model: predicts points.
@@ -106,7 +113,18 @@ def refine(
       init: rough part_from_camera, [3, 3] and [3]; 5 deg and 5 mm off are no trouble.
       max_iterations: of the last stage.
       seed: of the random subsets of points in the first stages.
+      max_allowance_mm: how large that offset may be; 0 for a part that is its CAD model. It is a
+        weak prior, normal with half of this as its deviation: only where the scan cannot tell
+        the offset from a motion, as on a single plane, does it count, and takes it for a motion.
+
+    Raises:
+      InputError: a negative or infinite ``max_allowance_mm``.
     """
+    if not 0 <= max_allowance_mm < np.inf:
+        raise InputError(
+            f"max_allowance_mm must be 0 mm or more and finite, got {max_allowance_mm!r}; "
+            "1 mm is usual for an investment casting"
+        )
     batch = RigidTransform(init.rotation[None], init.translation[None])
     coarse = points[subset(points, COARSE_POINTS, seed)]
     batch, iterations = descend(model, batch, coarse, iterations=25, settled_deg=0.02)
@@ -121,12 +139,16 @@ def refine(
         settled_deg=0.002,
     )
     iterations += more
-    if len(points) > 2 * MEDIUM_POINTS:
+    allowance = 0.0
+    # stock moves the part until it is known: the weights of a pose that far off are no use later
+    passes = 2 if max_allowance_mm else int(len(points) > 2 * MEDIUM_POINTS)
+    for _ in range(passes):
         medium = points[subset(points, MEDIUM_POINTS, seed)]
-        polished = _polish(model, medium, batch, max_iterations)
+        polished = _polish(model, medium, batch, max_iterations, allowance, max_allowance_mm)
         batch, iterations = polished.part_from_camera, iterations + polished.iterations
+        allowance = polished.allowance_mm
     points = points[subset(points, MOST_POINTS, seed)]
-    polished = _polish(model, points, batch, max_iterations)
+    polished = _polish(model, points, batch, max_iterations, allowance, max_allowance_mm)
     return Refinement(
         part_from_camera=RigidTransform(
             polished.part_from_camera.rotation[0], polished.part_from_camera.translation[0]
@@ -138,6 +160,8 @@ def refine(
         num_points=len(points),
         num_inliers=polished.num_inliers,
         information=polished.information,
+        allowance_mm=polished.allowance_mm,
+        allowance_sigma_mm=polished.allowance_sigma_mm,
     )
 
 
@@ -151,17 +175,30 @@ class _Polished:
     noise: Noise
     num_inliers: int
     information: np.ndarray
+    allowance_mm: float
+    allowance_sigma_mm: float
 
 
 def _polish(
-    model: MeasurementModel, points: np.ndarray, batch: RigidTransform, max_iterations: int
+    model: MeasurementModel,
+    points: np.ndarray,
+    batch: RigidTransform,
+    max_iterations: int,
+    allowance: float,
+    max_allowance_mm: float,
 ) -> _Polished:
     """Least squares along the rays, weighted by the noise that is fitted on the way."""
     patches = patches_of(model, points)
     converged = False
     weight = np.full(len(points), np.inf)
+    bare = points
+    if allowance:
+        bare = _bare(points, allowance, model.residuals(batch, points), batch)
     for step in range(max_iterations):
-        now = model.residuals(batch, points)
+        now = model.residuals(batch, bare)
+        columns = now.jacobian[0]
+        if max_allowance_mm:
+            columns = np.column_stack([columns, np.ones(len(points))])
         cosine = np.maximum(now.cosine[0], LEAST_COSINE)
         along = now.deviation_mm[0] / cosine
         if step < NOISE_FITS:  # then fixed: pose and noise would follow each other round
@@ -169,31 +206,63 @@ def _polish(
         fresh = weights(along, cosine, noise)
         # a ray that was off once stays out: else those at edges would come and go for ever
         weight = fresh if step < NOISE_FITS else np.minimum(weight, fresh)
-        weighted = now.jacobian[0] * (weight / cosine)[:, None]
+        weighted = columns * (weight / cosine)[:, None]
         scores = weighted * along[:, None]
-        information = weighted.T @ (now.jacobian[0] / cosine[:, None])
-        delta, known = _solve(information, scores.sum(axis=0), model.part.radius)
+        information = weighted.T @ (columns / cosine[:, None])
+        gradient = scores.sum(axis=0)
+        if max_allowance_mm:
+            prior = (2 / max_allowance_mm) ** 2
+            information[6, 6] += prior
+            gradient[6] -= prior * allowance
+        delta, known = _solve(information, gradient, model.part.radius)
         information /= inflation(information, scores - scores.mean(axis=0), patches)
-        batch = moved(model.part, batch, -delta[None])
-        if delta @ information @ delta < SETTLED**2 * 6:
+        batch = moved(model.part, batch, -delta[None, :6])
+        if max_allowance_mm:
+            allowance += float(delta[6])
+            bare = _bare(points, allowance, now, batch)
+        if delta @ information @ delta < SETTLED**2 * len(delta):
             converged = bool(known)
             break
+    pose_information, allowance_sigma = _without_allowance(information)
     return _Polished(
         part_from_camera=batch,
         converged=converged,
         iterations=step + 1,
         noise=noise,
         num_inliers=int(np.count_nonzero(weight)),
-        information=information,
+        information=pose_information,
+        allowance_mm=allowance,
+        allowance_sigma_mm=allowance_sigma,
     )
 
 
+def _bare(
+    points: np.ndarray, allowance: float, now: Residuals, part_from_camera: RigidTransform
+) -> np.ndarray:
+    """Points [n, 3], camera frame, as if the stock were taken off along the faces' normals.
+
+    To take it from the deviations would be wrong by more than the noise: where the surface is
+    curved, a ray meets the CAD model elsewhere than under the stock that it ends at.
+    """
+    normals = now.jacobian[0][:, 3:] @ part_from_camera.rotation[0]
+    return points - allowance * normals
+
+
+def _without_allowance(information: np.ndarray) -> tuple[np.ndarray, float]:
+    """[6, 6] of the pose alone where the offset is not known, and the offset's deviation in mm."""
+    if len(information) == 6:
+        return information, 0.0
+    pose, both, offset = information[:6, :6], information[:6, 6], information[6, 6]
+    left = offset - both @ np.linalg.pinv(pose, hermitian=True) @ both
+    return pose - np.outer(both, both) / offset, float(1 / np.sqrt(max(left, 1e-12)))
+
+
 def _solve(information: np.ndarray, gradient: np.ndarray, radius: float) -> tuple[np.ndarray, bool]:
-    """The Gauss-Newton step, and whether all six directions are known.
+    """The Gauss-Newton step, and whether all its directions are known.
 
     Directions in which the scan knows a million times less than in the best one stay as they are.
     """
-    unit = np.array([1 / radius] * 3 + [1.0] * 3)
+    unit = np.array([1 / radius] * 3 + [1.0] * (len(gradient) - 3))
     values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
     known = values > 1e-8 * max(values[-1], 1e-30)
     along = vectors.T @ (gradient * unit)
