@@ -171,3 +171,44 @@ def test_a_budget_ends_a_run_for_good(tmp_path, environment) -> None:
         assert told["wanted_steps"] == STEPS
         assert len(told["curve"]) == 1  # what was reached is validated
     assert arrays_of(workdir, 1)
+
+
+def test_training_on_scans_without_end_resumes_bit_equal(tmp_path, environment) -> None:
+    """Scan n is the same whoever asks for it: a run that is stopped sees what another one sees."""
+    endless = [
+        "--config.endless.sensor=paper_camera",
+        "--config.endless.resolution=0.125",
+        "--config.endless.casting_mm=0.5",
+        "--config.endless.castings=2",
+    ]
+    code, text = finish(tmp_path / "unbroken", environment, *endless)
+    assert code == 0, text
+    rows = [row for row in read_log(tmp_path / "unbroken") if "loss" in row]
+    assert all(np.isfinite(row["scan_wait_s"]) for row in rows)
+    workdir = tmp_path / "stopped"
+    process = start(workdir, environment, *endless)
+    wait_for_step(workdir, process, 15)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=60) == 128 + signal.SIGTERM
+    code, text = finish(workdir, environment, *endless)
+    assert code == 0, text
+    assert_bit_equal(tmp_path / "unbroken", workdir)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("--config.endless.sensor=hawk", "no sensor 'hawk'"),
+        ("--config.endless.castings=0", "castings=0 must be 1 or more"),
+        ("--config.data.shapes=solids", "train on one of them"),
+    ],
+)
+def test_endless_settings_that_give_no_scans_are_refused(
+    tmp_path, environment, override, words
+) -> None:
+    code, text = finish(
+        tmp_path / "run", environment, "--config.endless.sensor=paper_camera", override
+    )
+    assert code == 2, text
+    assert words in text
+    assert "Traceback" not in text

@@ -27,7 +27,8 @@ from vanejax.rigid_transform import RigidTransform
 from vanejax.scanner import Scanner
 from vanejax.sensor import Sensor, measure
 
-STEPS_AHEAD = 6
+# more than a log interval: the loop runs ahead of the device between two looks at its metrics
+STEPS_AHEAD = 16
 LEAST_POINTS = 32
 ATTEMPTS = 20
 _AHEAD_OF_VALIDATION = 1 << 40  # scan numbers that no training reaches
@@ -119,7 +120,7 @@ class ScanStream:
         scanner = self.castings[int(rng.integers(len(self.castings)))]
         for _ in range(ATTEMPTS):
             camera_from_part = self.views.draw(rng, self.part.center)
-            distance = float(np.linalg.norm(camera_from_part.apply(self.part.center)))
+            distance = float(np.linalg.norm(camera_from_part.apply(self.part.center[None])))
             sensor = self.sensor.another(rng).exposed_for(distance)
             try:
                 points = measure(scanner, sensor, camera_from_part, rng).points

@@ -322,7 +322,7 @@ class Scanner:
           [N] bool.
         """
         rotation = np.asarray(camera_from_part.rotation, np.float64)
-        center = camera_from_part.apply(self._center)
+        center = camera_from_part.apply(self._center[None])
         lit = np.einsum("ni,ni->n" if towards.ndim == 2 else "ni,i->n", normals, towards) > 0
         facing = np.flatnonzero(lit)
         # leave the face by several float32 roundings, on the side of the light
