@@ -12,6 +12,7 @@ from vanejax.camera import Camera, hemisphere_viewpoints
 from vanejax.casting import CUT, Casting, as_cast, waviness
 from vanejax.errors import InputError
 from vanejax.part import Part, part_from_mesh
+from vanejax.plotting.casting import casting_map
 from vanejax.scanner import Scanner
 from vanejax.vane import guide_vane
 
@@ -74,10 +75,10 @@ def test_stock_does_not_fold_a_concave_corner():
     """With waviness of nearly nothing, so that vertices stand within the stock of the corner."""
     casting = Casting(allowance_mm=1.0, waviness_mm=1e-6, wavelength_mm=2.5)
     cast = as_cast(bracket(), casting, rng())
-    straight = np.abs(cast.mesh.face_normals).max(axis=1)
-    assert straight.min() > 0.99  # every face still looks along an axis
     # as the L with each wall moved by 1 mm: 32 x 32 less 25 x 25, 22 high
     assert cast.mesh.volume == pytest.approx((32 * 32 - 25 * 25) * 22, rel=1e-3)
+    # what is folded over counts three times here, and not at all in the volume
+    assert cast.mesh.area == pytest.approx(2 * (32 * 32 - 25 * 25) + 4 * 32 * 22, rel=1e-3)
     assert cast.mesh.is_watertight
 
 
@@ -89,7 +90,7 @@ def test_the_vanes_casting_is_closed_and_within_its_limits(vane):
     assert cast.mesh.is_watertight
     assert not cast.notes  # nothing had to be repaired
     assert len(cast.mesh.faces) < 50_000
-    # towards the trailing edge from outside, along y: no casting is thinner than the CAD model
+    # along the normals, from outside, to the casting and to the CAD model under it
     points, normals, face = cast.sample(4_000, 0)
     origins = points + 5 * normals
     back = Scanner(vane).cast(origins, -normals).distance_mm
@@ -182,6 +183,17 @@ def test_a_scan_of_the_casting_lies_before_the_cads_by_the_offset(vane):
     assert same.mean() > 0.5
     assert np.median(along) == pytest.approx(0.5, abs=2e-3)
     assert np.mean(np.abs(along - 0.5) < 0.02) > 0.9
+
+
+def test_the_map_shows_the_offset(vane):
+    """Its colour bar spans what was asked for; a uniform one has a scale of its own."""
+    bar = casting_map(vane, as_cast(vane, STOCK, rng())).axes[-1]
+    low, high = bar.get_ylim()
+    assert low == pytest.approx(0.495, abs=0.01)
+    assert high == pytest.approx(0.505, abs=0.01)
+    waves = casting_map(box(), as_cast(box(), WAVES, rng())).axes[-1].get_ylim()
+    assert waves[0] == -waves[1]
+    assert 0.05 < waves[1] < 0.61
 
 
 # --- what cannot be cast --------------------------------------------------------------------------
