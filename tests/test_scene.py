@@ -161,7 +161,7 @@ def test_drops_sit_on_a_sphere_along_its_normal():
         assert 0.17 < distance.max() - 50 < 3.6  # a tan(contact / 2), a from 1 to 5
         # facets of 3 mm turn the normal by up to 2 deg
         assert np.dot(top, base) / distance.max() / distance.min() > np.cos(np.radians(2))
-        assert distance.min() < 50  # the skirt: no gap below the rim
+        assert distance.min() < 50 - 0.25  # the skirt: no gap below the rim
 
 
 def test_nothing_lies_where_there_is_nothing_to_lie_on():
