@@ -8,12 +8,13 @@ import itertools
 import numpy as np
 import pytest
 import trimesh
+from scipy.special import erf
 
 from vanejax.camera import Camera, hemisphere_viewpoints, look_at
 from vanejax.errors import InputError
 from vanejax.exposure import Exposure
 from vanejax.part import Part, part_from_mesh
-from vanejax.range_errors import Lens, Trueness
+from vanejax.range_errors import Lens, Trueness, rim, windowed
 from vanejax.scanner import Scanner
 from vanejax.sensor import PRESETS, Measurement, Reason, Sensor, measure, preset
 from vanejax.vane import guide_vane
@@ -327,6 +328,10 @@ def test_fewer_pixels_leave_the_errors_in_mm(plate):
         ("baseline_mm", 0.0),
         ("most_incidence_deg", 91.0),
         ("noise_px", -1.0),
+        ("window_px", -1.0),
+        ("adhesion_px", float("nan")),
+        ("rim_px", -0.5),
+        ("incidence_spread_deg", -1.0),
         ("correlation_px", 0.5),
         ("mixed_share", 1.5),
         ("outlier_share", float("nan")),
@@ -341,3 +346,110 @@ def test_a_sensor_that_cannot_be_is_refused(name, value):
 def test_an_unknown_preset_is_answered_with_the_known_ones():
     with pytest.raises(InputError, match="ideal, paper_camera, consumer_depth"):
         preset("hawk")
+
+
+def roof(slope: float) -> Scanner:
+    """A ridge along y through (0, 0, 0), seen from above; both sides fall off by ``slope``."""
+    mesh = trimesh.convex.convex_hull(
+        [(x, y, z) for x, z in ((-60, -60 * slope), (60, -60 * slope), (0, 0)) for y in (-40, 40)]
+    )
+    return Scanner(part_from_mesh(mesh.vertices, mesh.faces, name="roof"))
+
+
+def test_a_matching_window_rounds_a_ridge_off():
+    """On the ridge of slopes +k and -k it is the mean of k |x| over the window."""
+    camera = Camera(width=640, height=128, fov_y_deg=12.0, near_mm=100.0)
+    sensor = Sensor(camera=camera, window_px=3.0, jump_mm=20.0)
+    scan = take(roof(0.8), sensor)
+    middle = (scan.pixel // camera.width == 64) & (abs(scan.pixel % camera.width - 319.5) < 1)
+    assert middle.sum() == 2
+    across = ABOVE.inverse().apply(scan.ideal.points.astype(np.float64))[:, 0]
+    pitch = 400 / camera.fx
+    # half a column beside the ridge: the mean of |x| over a window there, less the pixel's own
+    over_window = 3.0 * np.sqrt(2 / np.pi) * np.exp(-(0.5**2) / 18) + 0.5 * erf(0.5 / np.sqrt(18))
+    # the pitch is that at the ridge's depth, and the window reaches 4 mm behind it
+    missing = 0.8 * pitch * (over_window - 0.5)
+    np.testing.assert_allclose(depth_error(scan)[middle], missing, rtol=0.02)
+    inside = (np.abs(across) > 20 * pitch) & (np.abs(across) < 60 - 20 * pitch)
+    inside &= np.abs(scan.pixel // camera.width - 64) < 40
+    assert inside.sum() > 1000
+    # planes keep their disparity: it is linear in the image
+    np.testing.assert_allclose(depth_error(scan)[inside], 0, atol=2e-3)
+
+
+def test_what_a_window_matched_beside_its_pixel_errs_by_the_slope():
+    slope, adhesion = 0.8, 0.5
+    sensor = Sensor(camera=CAMERA, adhesion_px=adhesion, correlation_px=4.0, jump_mm=20.0)
+    errors = []
+    for seed in range(4):
+        scan = take(roof(slope), sensor, seed=seed)
+        across = ABOVE.inverse().apply(scan.ideal.points.astype(np.float64))[:, 0]
+        inner = (np.abs(across) > 6) & (np.abs(across) < 54)
+        errors.append(depth_error(scan)[inner])
+    # one column is depth / fx mm wide; from above a slope of 1 is seen at 45 deg
+    expected = slope * adhesion * 400 / CAMERA.fx
+    np.testing.assert_allclose(np.concatenate(errors).std(), expected, rtol=0.15)
+
+
+def test_a_flat_plate_is_the_same_for_any_window(plate):
+    flat = take(plate, Sensor(camera=CAMERA, window_px=2.0, adhesion_px=2.0))
+    np.testing.assert_allclose(depth_error(flat), 0, atol=1e-3)  # f32 eps times 400, and a sum
+
+
+def test_a_window_is_a_weighted_mean_of_the_pixels_that_see_the_part():
+    rng = np.random.default_rng(0)
+    row, column = np.nonzero(rng.random((17, 23)) < 0.7)
+    row, column = row + 100, column + 40
+    disparity = rng.uniform(10, 20, len(row)).astype(np.float32)
+    found = windowed(row, column, disparity, window_px=1.5)
+    for k in range(0, len(row), 7):
+        squared = (row - row[k]) ** 2 + (column - column[k]) ** 2
+        # scipy cuts the window at 4 standard deviations along each axis
+        near = np.maximum(abs(row - row[k]), abs(column - column[k])) <= 6
+        weight = np.exp(-0.5 * squared / 1.5**2) * near
+        np.testing.assert_allclose(found[k], np.sum(weight * disparity) / weight.sum(), rtol=1e-5)
+    aside = np.stack([np.full(len(row), 1.0), np.full(len(row), -2.0)])
+    shifted = windowed(row, column, disparity, window_px=1.5, aside_px=aside)
+    place = {(r, c): k for k, (r, c) in enumerate(zip(row, column, strict=True))}
+    pairs = [(k, place[r + 1, c - 2]) for (r, c), k in place.items() if (r + 1, c - 2) in place]
+    assert len(pairs) > 50
+    here, there = np.transpose(pairs)
+    np.testing.assert_allclose(shifted[here], found[there], rtol=1e-5)
+    assert not len(windowed(row[:0], column[:0], disparity[:0], window_px=1.0))
+
+
+def test_a_rim_is_what_lies_near_a_pixel_that_sees_nothing():
+    rng = np.random.default_rng(1)
+    seen = rng.random((20, 30)) < 0.95
+    row, column = np.nonzero(seen)
+    width = rng.uniform(0, 3, len(row))
+    beside = np.argwhere(~np.pad(seen, 1)) - 1
+    nearest = np.min(np.hypot(*(np.stack([row, column], -1)[:, None] - beside).T), axis=0)
+    np.testing.assert_array_equal(rim(row + 7, column + 5, width), nearest - 0.5 < width)
+    assert not rim(row, column, np.zeros(len(row))).any()
+    assert not len(rim(row[:0], column[:0], width[:0]))
+
+
+def test_the_outline_is_lost_and_nothing_else(plate):
+    scan = take(plate, Sensor(camera=CAMERA, rim_px=2.0))
+    lost = scan.reason == Reason.LOST
+    x, y = np.abs(ABOVE.inverse().apply(scan.ideal.points.astype(np.float64))[:, :2]).T
+    from_outline = np.minimum((90 - x) * CAMERA.fx, (60 - y) * CAMERA.fy) / 400
+    assert from_outline[lost].max() < 2.0 * 6  # a normal number above 5 is not met
+    at_rim = from_outline < 1.5
+    assert 0.4 < lost[at_rim].mean() < 0.9
+
+
+def test_the_limit_of_incidence_varies_from_place_to_place():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
+    scanner = Scanner(part_from_mesh(ball.vertices, ball.faces, name="ball"))
+    sensor = Sensor(
+        camera=CAMERA, most_incidence_deg=60.0, incidence_spread_deg=5.0, correlation_px=3.0
+    )
+    scans = [take(scanner, sensor, seed=seed) for seed in range(3)]
+    incidence = np.concatenate([scan.ideal.incidence_deg for scan in scans])
+    lost = np.concatenate([scan.reason == Reason.GRAZING for scan in scans])
+    for angle, share in ((50.0, 0.023), (60.0, 0.5), (70.0, 0.977)):
+        near = np.abs(incidence - angle) < 0.7
+        # the field has few independent places in so narrow a ring
+        assert abs(lost[near].mean() - share) < 0.1, angle

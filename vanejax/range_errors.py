@@ -1,4 +1,4 @@
-"""Errors of measured ranges: smooth random fields, mixed pixels, lens and trueness.
+"""Errors of measured ranges: random fields, windows, mixed pixels, lens and trueness.
 
 A camera and a projector triangulate: a surface at the depth z appears shifted by the disparity
 ``d = f b / z`` pixels, with the focal length f in pixels and the baseline b in mm. What goes wrong
@@ -11,6 +11,7 @@ import dataclasses
 import math
 
 import numpy as np
+from scipy import ndimage
 
 from vanejax.errors import InputError
 
@@ -107,6 +108,59 @@ def _spline(count: int, length_px: float) -> np.ndarray:
     )
     weight /= np.linalg.norm(weight, axis=1, keepdims=True)
     return weight.astype(np.float32)
+
+
+def windowed(
+    row: np.ndarray,
+    column: np.ndarray,
+    disparity: np.ndarray,
+    *,
+    window_px: float,
+    aside_px: np.ndarray | None = None,
+) -> np.ndarray:
+    """The mean disparity around each pixel [N] f32, among the pixels given.
+
+    Stereo compares windows, not pixels: it finds the mean disparity of what a window holds, which
+    rounds edges off. More exactly it finds that of the texture in the window, which lies beside the
+    pixel as chance will have it (the adhesion of area-based matching).
+
+    Args:
+      row, column: [N] i32, of the pixels that see the part; what lies beside it has no say.
+      disparity: [N] f32.
+      window_px: standard deviation of the Gaussian window.
+      aside_px: [2, N], how many rows and columns beside its pixel each window's middle lies; none
+        where the part is no longer there.
+    """
+    if not len(row):
+        return disparity
+    place = row - row.min(), column - column.min()
+    shape = tuple(int(p.max()) + 1 for p in place)
+    total, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    total[place], weight[place] = disparity, 1
+    total, weight = (
+        ndimage.gaussian_filter(image, window_px, mode="constant") for image in (total, weight)
+    )
+    own = total[place] / weight[place]
+    if aside_px is None:
+        return own
+    middle = np.stack(place) + aside_px
+    total, weight = (
+        ndimage.map_coordinates(image, middle, order=1, mode="nearest") for image in (total, weight)
+    )
+    return np.where(weight > 0.25, total / np.maximum(weight, 0.25), own)
+
+
+def rim(row: np.ndarray, column: np.ndarray, width_px: np.ndarray) -> np.ndarray:
+    """[N] bool: whether the centre of a pixel is nearer than ``width_px`` [N] to the outline.
+
+    The outline runs between the pixels [N] that see the part and all others.
+    """
+    if not len(row):
+        return np.zeros(0, bool)
+    place = row - row.min() + 1, column - column.min() + 1
+    seen = np.zeros(tuple(int(p.max()) + 2 for p in place), bool)
+    seen[place] = True
+    return ndimage.distance_transform_edt(seen)[place] - 0.5 < width_px
 
 
 def jumps(

@@ -19,7 +19,15 @@ import numpy as np
 from vanejax.camera import Camera
 from vanejax.errors import InputError
 from vanejax.exposure import REFERENCE_MM, Exposure
-from vanejax.range_errors import Lens, Trueness, jumps, mixed_disparity, smooth_field
+from vanejax.range_errors import (
+    Lens,
+    Trueness,
+    jumps,
+    mixed_disparity,
+    rim,
+    smooth_field,
+    windowed,
+)
 from vanejax.rigid_transform import RigidTransform
 from vanejax.scanner import Scan, Scanner
 
@@ -37,7 +45,7 @@ class Reason(enum.IntEnum):
     DARK = 4
     """Too little of the projector's light comes back."""
     LOST = 5
-    """No match was found, for no reason that is modelled."""
+    """No match was found: singly, or along the part's outline."""
     OUT_OF_RANGE = 6
     """Measured before the near or behind the far clip plane."""
     NOTHING = 7
@@ -53,12 +61,21 @@ class Sensor:
       baseline_mm: from the camera to the projector, along the camera's +x (negative: to its left).
       shadow: whether what the projector does not see is left out.
       most_incidence_deg: surfaces seen flatter are not measured; 90 for no limit.
+      incidence_spread_deg: standard deviation of that limit from place to place, smooth over
+        ``correlation_px``.
       exposure: light and shine; None: every surface is bright enough and none too bright.
       noise_px: standard deviation of the disparity, white; at `Exposure.reference_signal` if there
         is an exposure.
       correlated_px: standard deviation of an error of the disparity that is smooth in the image,
         and new in every scan.
       correlation_px: its length, see `range_errors.smooth_field`.
+      window_px: the matching window of a stereo camera, as the standard deviation of a Gaussian: it
+        rounds edges off, see `range_errors.windowed`; 0 for a camera that codes single pixels.
+      adhesion_px: standard deviation, in columns and in rows, of how far beside its pixel the
+        texture lies that a window matched; smooth over ``correlation_px``. The error grows with the
+        slope of the surface.
+      rim_px: how wide a strip along the part's outline finds no match, on average; its width
+        varies as the correlated error does, see `range_errors.rim`.
       mixed_share: of the places where the depth jumps, those where a pixel mixes both sides.
       jump_mm: what difference of neighbouring depths is a jump.
       step_px, step_mm: disparities, and depths, are rounded to multiples of it; 0 for none.
@@ -76,10 +93,14 @@ class Sensor:
     baseline_mm: float = 120.0
     shadow: bool = False
     most_incidence_deg: float = 90.0
+    incidence_spread_deg: float = 0.0
     exposure: Exposure | None = None
     noise_px: float = 0.0
     correlated_px: float = 0.0
     correlation_px: float = 16.0
+    window_px: float = 0.0
+    adhesion_px: float = 0.0
+    rim_px: float = 0.0
     mixed_share: float = 0.0
     jump_mm: float = 2.0
     step_px: float = 0.0
@@ -97,7 +118,18 @@ class Sensor:
             raise InputError(
                 f"sensor: most_incidence_deg={self.most_incidence_deg!r} must lie in (0, 90]"
             )
-        for name in ("noise_px", "correlated_px", "step_px", "step_mm", "outlier_mm", "jump_mm"):
+        for name in (
+            "noise_px",
+            "correlated_px",
+            "incidence_spread_deg",
+            "window_px",
+            "adhesion_px",
+            "rim_px",
+            "step_px",
+            "step_mm",
+            "outlier_mm",
+            "jump_mm",
+        ):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"sensor: {name}={getattr(self, name)!r} must be 0 or more")
         if not 1 <= self.correlation_px < math.inf:
@@ -130,6 +162,9 @@ class Sensor:
             noise_px=self.noise_px * factors,
             correlated_px=self.correlated_px * factors,
             correlation_px=max(1.0, self.correlation_px * factors),
+            window_px=self.window_px * factors,
+            adhesion_px=self.adhesion_px * factors,
+            rim_px=self.rim_px * factors,
             step_px=self.step_px * factors,
             lens=lens,
         )
@@ -153,7 +188,8 @@ class Sensor:
 
         Errors of calibration are normally distributed with this sensor's as standard deviations;
         all other magnitudes, light and finish of the surface among them, are multiplied by the
-        exponential of a normal number of standard deviation ``spread``.
+        exponential of a normal number of standard deviation ``spread``. Settings of the matching,
+        such as its window, stay.
         """
 
         def vary(value: float) -> float:
@@ -229,8 +265,14 @@ def paper_camera() -> Sensor:
 
 
 def consumer_depth() -> Sensor:
-    """A short-range stereo depth camera with a pattern projector, in steps of 1 mm."""
-    width, height, focal = 424, 240, 220.0
+    """A short-range stereo depth camera, in steps of 1 mm.
+
+    The focal length is that of the pixel grid of 15 real scans; the magnitudes are those for which
+    virtual scans of the same parts in the same poses have residuals, steps and holes most alike
+    (`experiments.sensor_fit`, on every other scan; docs/real_scans.md). The baseline is that of
+    such a camera.
+    """
+    width, height, focal = 424, 240, 212.945
     opening = [math.degrees(2 * math.atan(size / (2 * focal))) for size in (width, height)]
     return Sensor(
         camera=Camera(
@@ -241,14 +283,19 @@ def consumer_depth() -> Sensor:
             near_mm=50.0,
         ),
         baseline_mm=18.0,
-        most_incidence_deg=82.0,
-        noise_px=0.03,
-        correlated_px=0.08,
-        correlation_px=10.0,
+        shadow=True,
+        most_incidence_deg=76.0,
+        incidence_spread_deg=10.0,
+        noise_px=0.005,
+        correlated_px=0.044,
+        correlation_px=14.0,
+        window_px=2.6,
+        adhesion_px=1.1,
+        rim_px=0.87,
         mixed_share=0.5,
-        jump_mm=4.0,
+        jump_mm=10.0,
         step_mm=1.0,
-        lost_share=0.05,
+        lost_share=0.017,
     )
 
 
@@ -385,6 +432,8 @@ class _Sensing:
         if sensor.lost_share:
             lost = self.rng.random(len(self.reason), dtype=np.float32) < sensor.lost_share
             self._drop(lost, Reason.LOST)
+        if sensor.rim_px:
+            self._drop(self._at_outline(), Reason.LOST)
         kept = np.flatnonzero(self.reason == Reason.MEASURED)
         points = self._measured(kept)
         depth = -points[:, 2]
@@ -394,6 +443,19 @@ class _Sensing:
 
     def _drop(self, which: np.ndarray, reason: Reason) -> None:
         self.reason[which & (self.reason == Reason.MEASURED)] = reason
+
+    def _at_outline(self) -> np.ndarray:
+        """[N] bool, the pixels whose window holds too much of what is not the part."""
+        row, column = self._places()
+        return rim(row, column, self.sensor.rim_px * (1 + self._field(row, column)))
+
+    def _places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns [N]."""
+        return np.divmod(self.scan.pixel, np.int32(self.sensor.camera.width))
+
+    def _field(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """[N] f32: a new random field as smooth as the correlated error."""
+        return smooth_field(self.rng, row, column, length_px=self.sensor.correlation_px)
 
     def _drop_dark(self) -> None:
         """Shadow, grazing incidence and exposure."""
@@ -407,7 +469,13 @@ class _Sensing:
         if sensor.most_incidence_deg < 90:
             inverse = 1 / np.sqrt(np.einsum("ni,ni->n", points, points))
             cosine = -np.einsum("ni,ni->n", points, normals) * inverse
-            least = np.float32(math.cos(math.radians(sensor.most_incidence_deg)))
+            if sensor.incidence_spread_deg:
+                limit = sensor.most_incidence_deg + sensor.incidence_spread_deg * self._field(
+                    *self._places()
+                )
+                least = np.cos(np.radians(np.clip(limit, 0, 90)))
+            else:
+                least = np.float32(math.cos(math.radians(sensor.most_incidence_deg)))
             self._drop(cosine < least, Reason.GRAZING)
         if sensor.exposure is not None:
             self._expose(sensor.exposure, to_projector, lit)
@@ -464,6 +532,20 @@ class _Sensing:
                 points[:, axis] += (measured * shift).astype(np.float32)
         return points
 
+    def _window_shifts(self) -> np.ndarray:
+        """[N] f32 pixels: what the matching window adds to the disparity of all that is seen."""
+        sensor = self.sensor
+        row, column = self._places()
+        depth = -self.scan.points[:, 2]
+        true = np.float32(sensor.focal_baseline) / depth
+        aside = None
+        if sensor.adhesion_px:
+            aside = sensor.adhesion_px * np.stack([self._field(row, column) for _ in range(2)])
+        mean = windowed(row, column, true, window_px=sensor.window_px, aside_px=aside)
+        # a window over two surfaces that lie apart locks onto its own
+        near = np.abs(np.float32(sensor.focal_baseline) / mean - depth) < sensor.jump_mm
+        return np.where(near, mean - true, np.float32(0))
+
     def _triangulated(self, depth: np.ndarray, pixel: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Depths [n] f32 from disparities with their errors; the same array without any."""
         sensor, rng = self.sensor, self.rng
@@ -477,9 +559,12 @@ class _Sensing:
             field = smooth_field(rng, row, column, length_px=sensor.correlation_px)
             field *= np.float32(sensor.correlated_px)
             error = field if error is None else error + field
-        if error is None and not (sensor.mixed_share or sensor.step_px):
+        matched = sensor.window_px or sensor.adhesion_px
+        if error is None and not (sensor.mixed_share or sensor.step_px or matched):
             return depth
         disparity = np.float32(sensor.focal_baseline) / depth
+        if matched:
+            disparity += self._window_shifts().take(kept)
         if error is not None:
             disparity += error
         if sensor.mixed_share:
