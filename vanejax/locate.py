@@ -13,6 +13,7 @@ import numpy as np
 
 from vanejax.covariance import uncertainty
 from vanejax.errors import InputError
+from vanejax.foreign_points import attempts, with_others, without_others
 from vanejax.measured_scan import MeasuredScan, clean_scan
 from vanejax.part import Part, load_part
 from vanejax.pose_result import Alternative, PoseResult
@@ -52,6 +53,7 @@ REACH = 0.3  # of the part's radius: how far a surface partner is sought where n
 STARTS = (400, 800)
 # a guess is good to this; a pose farther away that fits as well is no reason to doubt it
 GUESS_DEG, GUESS_SHIFT = 30.0, 0.3
+STATUSES = ("rejected", "ambiguous", "accepted")  # better and better
 MATCH_ITERATIONS = 1  # of RPM-Net from each of 60 rotations: ray casting does the rest
 
 
@@ -65,6 +67,7 @@ def register(
     init: RigidTransform | None = None,
     weights: TrainedMatcher | str | os.PathLike[str] | None = None,
     limits: Limits | None = None,
+    segment: str = "auto",
     seed: int = 0,
 ) -> PoseResult:
     """Finds where a part is in a scan, how sure that is, and whether to trust it.
@@ -86,6 +89,9 @@ def register(
       init: rough part_from_camera. Poses far from it that fit as well are then no ambiguity.
       weights: what `vanejax export` wrote for this part, or its path.
       limits: of the verdict.
+      segment: whether table, clamps and chips are taken out of the scan first, see
+        `vanejax.segmentation`: "off", "on", or "auto", which does so where the scan is not sound
+        as it is, or has more than a third of other things. What touches the part may stay.
       seed: of all random subsets: same seed, same result.
 
     Raises:
@@ -108,6 +114,31 @@ def register(
             scan = load_scan(
                 scan, units=units_scan, part_extent_mm=part.extent_mm, sensor_origin=sensor_origin
             )
+    settings = (part, init, weights, limits, seed, seconds)
+    results = []
+    for segments in attempts(scan, part, segment, seed=seed):
+        if segments is None:
+            result = _located(scan, *settings)
+        else:
+            result = _located(without_others(scan, segments), *settings)
+            model = _model(scan, part)
+            result = with_others(result, scan, segments, model, limits=limits, seed=seed)
+        if _is_sound(result, limits):
+            return result
+        results.append(result)
+    return max(results, key=lambda r: (STATUSES.index(r.verdict.status), r.verification.support))
+
+
+def _located(
+    scan: MeasuredScan,
+    part: Part,
+    init: RigidTransform | None,
+    weights: TrainedMatcher | None,
+    limits: Limits | None,
+    seed: int,
+    seconds: dict[str, float],
+) -> PoseResult:
+    """The pose of the part in a scan, also where the sensor's place turns out to be assumed."""
     result = _locate(scan, part, init, weights, limits, seed, seconds, STARTS)
     if scan.origin_is_assumed and not _is_sound(result, limits):
         # perhaps the cloud was moved after it was taken: then the rays are wrong, not the pose

@@ -47,6 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="where the sensor stood, in mm in the scan's frame; unknown for merged clouds; "
         "by default the scan's origin",
     )
+    parser.add_argument(
+        "--segment",
+        choices=("auto", "off", "on"),
+        default="auto",
+        help="take table, clamps and chips out of the scan first: auto (default) does so where "
+        "the scan does not do as it is",
+    )
     parser.add_argument("--json", metavar="FILE", help="write the pose and all figures here")
     parser.add_argument("--report", metavar="FILE", help="write an HTML report here")
     parser.add_argument("--seed", type=int, default=0, help="of what is drawn at random (0)")
@@ -90,7 +97,9 @@ def run(arguments: argparse.Namespace) -> int:
     from vanejax.locate import register
 
     prepared = time.perf_counter()
-    result = register(scan, part, init=init, weights=matcher, seed=arguments.seed)
+    result = register(
+        scan, part, init=init, weights=matcher, segment=arguments.segment, seed=arguments.seed
+    )
     ended = time.perf_counter()
     color = wants_color()
     if arguments.quiet:

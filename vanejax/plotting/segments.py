@@ -1,0 +1,83 @@
+"""One picture of a segmentation: what each point of a scan was taken for, beside what it is."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from vanejax.camera import Camera
+from vanejax.errors import InputError
+from vanejax.plotting.canvas import INK, REFERENCE_RED, SOURCE_GREEN, new_figure
+from vanejax.plotting.shading import shade
+from vanejax.scanner import Scan
+from vanejax.scene import Scene
+from vanejax.segmentation import Segment, Segments
+
+TABLE_SAND = "#d9c9a3"
+_COLORS = {
+    Segment.PART: SOURCE_GREEN,
+    Segment.TABLE: TABLE_SAND,
+    Segment.OTHER: REFERENCE_RED,
+}
+_NAMES = {Segment.PART: "part", Segment.TABLE: "table", Segment.OTHER: "other things"}
+
+
+def segments_picture(scan: Scan, camera: Camera, scene: Scene, segments: Segments) -> Figure:
+    """A scene as the camera sees it, coloured twice: by the segmentation, and by the truth.
+
+    Args:
+      scan: of the whole scene, N pixels.
+      camera: that made it.
+      scene: that was scanned: it knows whose each face is.
+      segments: of the scan's points, noisy or not, in their order.
+
+    Raises:
+      InputError: segments of another number of points.
+    """
+    if len(segments.label) != len(scan.points):
+        raise InputError(
+            f"the scan has {len(scan.points):,} points, the segmentation {len(segments.label):,}"
+        )
+    owner = scene.owner(scan.face)
+    kinds = [Segment.PART] + [
+        Segment.TABLE if extra.kind == "table" else Segment.OTHER for extra in scene.extras
+    ]
+    truth = np.array(kinds, np.uint8)[owner]
+    light = shade(scan, camera)
+    aspect = camera.fx / camera.fy
+    height_in = 4.6 * aspect * camera.height / camera.width
+    figure = new_figure(9.6, height_in + 0.9)
+    wrong = float(np.mean(segments.label != truth))
+    for axes, label, title in zip(
+        figure.subplots(1, 2),
+        (segments.label, truth),
+        (f"taken for ({wrong:.1%} of the points otherwise than they are)", "truth"),
+        strict=True,
+    ):
+        _draw(axes, _colored(light, scan, camera, label), aspect, title)
+    present = [s for s in Segment if np.any(truth == s) or np.any(segments.label == s)]
+    handles = [
+        figure.axes[0].scatter([], [], s=50, color=_COLORS[s], label=_NAMES[s]) for s in present
+    ]
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=10,
+        labelcolor=INK,
+    )  # fmt: skip
+    return figure
+
+
+def _colored(light: np.ndarray, scan: Scan, camera: Camera, label: np.ndarray) -> np.ndarray:
+    """[H, W, 3]: the shaded image in the colours of the labels [N], white where nothing is."""
+    image = np.ones((camera.height * camera.width, 3))
+    grey = light.reshape(-1, 3)[scan.pixel].mean(axis=1, keepdims=True)
+    colors = np.array([to_rgb(_COLORS[s]) for s in Segment])
+    image[scan.pixel] = np.clip(grey / np.percentile(grey, 80), 0.25, 1.1) * colors[label]
+    return np.clip(image, 0, 1).reshape(camera.height, camera.width, 3)
+
+
+def _draw(axes: Axes, image: np.ndarray, aspect: float, title: str) -> None:
+    axes.imshow(image, aspect=aspect, interpolation="antialiased")
+    axes.set_axis_off()
+    axes.set_title(title, color=INK, fontsize=10)
