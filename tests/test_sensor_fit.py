@@ -124,15 +124,43 @@ def test_figures_of_white_noise():
 
 def test_figures_of_smooth_errors_holes_and_steps():
     column = np.arange(120.0)
-    smooth = np.broadcast_to(np.sin(column / 30), (100, 120)).copy()
+    smooth = np.sin((column + np.arange(100.0)[:, None]) / 30)
     figures = statistics([image(smooth)])
     near, far = (figures[f"residuals {lag} px apart: difference (mm)"] for lag in (1, 20))
-    assert near < 0.1 * far
+    # along a line the differences grow nearly in proportion to the distance
+    assert far == pytest.approx(20 * near, rel=0.15)
     smooth[:, ::4] = np.nan
     assert statistics([image(smooth)])["inside, 0 to 40 deg: not measured (share)"] == 0.25
     stepped = np.floor(np.broadcast_to(column / 10, (100, 120)))
     same = statistics([image(stepped)])["neighbours of the same depth (share)"]
     assert same == pytest.approx(108 / 119)
+
+
+def test_what_lies_near_an_edge_is_counted_apart():
+    rng = np.random.default_rng(0)
+    scan = image(0.5 * rng.standard_normal((100, 120)))
+    edge = np.full(scan.edge_px.shape, 50.0)
+    edge[:, :60] = 1.0
+    residual = scan.residual_mm
+    residual[:, :60] = 5.0
+    residual[:50, :60] = np.nan
+    beside = dataclasses.replace(scan, measured=200.0 + residual, edge_px=edge)
+    figures, gap = statistics([beside]), residual_gap([scan], [beside])
+    assert figures["inside: spread (mm)"] == pytest.approx(0.5, rel=0.05)
+    assert figures["inside: beyond 3 spreads (share)"] < 0.01
+    assert figures["residuals 3 px apart: difference (mm)"] == pytest.approx(0.71, rel=0.05)
+    assert figures["inside, 0 to 40 deg: not measured (share)"] == 0
+    assert figures["at edges: not measured (share)"] == 0.5
+    assert figures["at edges: beyond 3 spreads (share)"] == 1
+    assert gap < 0.03
+
+
+def test_points_off_the_outline_are_measured_where_nothing_is_predicted():
+    scan = image(np.zeros((40, 50)))
+    predicted = scan.predicted.copy()
+    predicted[:, :10] = np.nan
+    figures = statistics([dataclasses.replace(scan, predicted=predicted)])
+    assert figures["points off the outline (share)"] == pytest.approx(0.2)
 
 
 def test_rounding_is_the_share_of_what_a_window_would_add():
@@ -151,6 +179,14 @@ def test_distances_are_logarithms_of_ratios():
     nothing = {"a (mm)": 0.0, "b (share)": float("nan"), "c (ratio)": -3.0}
     assert unlikeness(one, nothing).keys() == {"a (mm)", "c (ratio)"}
     assert np.isfinite(distance(one, nothing))
+    # a slope below 0 is as little as none
+    none = unlikeness({"c (ratio)": 0.0}, one)["c (ratio)"]
+    assert unlikeness({"c (ratio)": -3.0}, one)["c (ratio)"] == none
+
+
+def test_the_scans_of_the_fit_are_not_those_of_the_test():
+    fitted, held_out = sensor_fit.halves(list("abcde"))
+    assert (fitted, held_out) == (["a", "c", "e"], ["b", "d"])
 
 
 def test_the_gap_of_residuals_is_between_0_and_1():
