@@ -14,13 +14,13 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from vanejax import sensor as sensors
+from vanejax import measurement
 from vanejax.camera import Camera
 from vanejax.errors import InputError
 from vanejax.part import Part
 from vanejax.rigid import RigidTransform
 from vanejax.scanner import Scanner
-from vanejax.sensor import Sensor
+from vanejax.sensor import Sensor, consumer_depth, paper_camera
 
 KINDS = ("structured_light", "depth_camera", "clutter")
 HOLES = (1, 5)  # round ones, in scans of the depth camera
@@ -40,8 +40,8 @@ def sensor(kind: str) -> Sensor:
     if kind not in KINDS:
         raise InputError(f"no sensor kind {kind!r}; there are {', '.join(KINDS)}")
     if kind == "depth_camera":
-        return sensors.consumer_depth()
-    coarse = sensors.paper_camera().scaled(0.5)
+        return consumer_depth()
+    coarse = paper_camera().scaled(0.5)
     return dataclasses.replace(coarse, camera=dataclasses.replace(coarse.camera, near_mm=50.0))
 
 
@@ -84,7 +84,7 @@ def measure(
     """
     used = sensor(kind).exposed_for(-float(camera_from_part.apply(part.center[None])[0, 2]))
     rng = np.random.default_rng([seed, KINDS.index(kind)])
-    taken = sensors.measure(scanner, used, camera_from_part, rng)
+    taken = measurement.measure(scanner, used, camera_from_part, rng)
     images = taken.organised()
     points = images["points"].astype(np.float64)
     depth = -points[..., 2]
@@ -94,7 +94,7 @@ def measure(
     if kind == "clutter" and len(taken.points):
         share = rng.uniform(*CLUTTER_SHARE)
         if rng.random() < 0.5:
-            covered = images["reason"] != sensors.Reason.NOTHING
+            covered = images["reason"] != measurement.Reason.NOTHING
             vertices = camera_from_part.apply(part.mesh.vertices)
             whole = _table(used, depth, covered, vertices, share, rng)
         else:

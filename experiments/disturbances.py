@@ -10,13 +10,14 @@ import numpy as np
 
 from vanejax.camera import hemisphere_viewpoints
 from vanejax.casting import Casting, as_cast
+from vanejax.measurement import Measurement, Reason, measure
 from vanejax.part import Part
 from vanejax.rigid_transform import RigidTransform
 from vanejax.scan_stream import RandomViews
 from vanejax.scanner import Scanner
 from vanejax.scene import Clutter, clutter_scene
 from vanejax.segmentation import segment
-from vanejax.sensor import Measurement, Reason, Sensor, measure, preset
+from vanejax.sensor import Sensor, preset
 
 DISTANCE_MM = 400.0
 ELEVATION_DEG = 75.0

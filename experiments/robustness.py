@@ -31,6 +31,7 @@ from vanejax.errors import InputError
 from vanejax.locate import register
 from vanejax.matched_poses import match_poses
 from vanejax.measured_scan import MeasuredScan
+from vanejax.measurement import measure
 from vanejax.model_file import TrainedMatcher, load_model
 from vanejax.part import Part
 from vanejax.plotting.canvas import save_figure
@@ -40,7 +41,7 @@ from vanejax.residuals import RayCasting
 from vanejax.rigid_transform import RigidTransform
 from vanejax.scan_stream import RandomViews
 from vanejax.scanner import Scanner
-from vanejax.sensor import measure, preset
+from vanejax.sensor import preset
 from vanejax.surface import Surface
 from vanejax.vane import guide_vane
 

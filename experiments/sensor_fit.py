@@ -34,7 +34,7 @@ from experiments.sensor_statistics import (
     residual_gap,
     statistics,
 )
-from vanejax import sensor as sensors
+from vanejax import measurement
 from vanejax.camera import Camera, field_of_view_deg
 from vanejax.part import load_part
 from vanejax.plotting.canvas import FAINT, INK, REFERENCE_RED, new_figure, save_figure, style_chart
@@ -42,7 +42,7 @@ from vanejax.residuals import RayCasting
 from vanejax.rigid import RigidTransform
 from vanejax.scan_file import load_scan
 from vanejax.scanner import Scanner
-from vanejax.sensor import Sensor
+from vanejax.sensor import Sensor, consumer_depth
 from vanejax.surface import Surface
 
 FOCAL_PX = (150.0, 300.0)  # between which that of the real camera is sought
@@ -134,7 +134,7 @@ def measured_by(scans: Sequence[RealScan], sensor: Sensor, seed: int) -> list[Co
     result = []
     for number, scan in enumerate(scans):
         rng = np.random.default_rng([seed, number])
-        taken = sensors.measure(scan.model.scanner, sensor, scan.camera_from_part, rng)
+        taken = measurement.measure(scan.model.scanner, sensor, scan.camera_from_part, rng)
         points = taken.points.astype(np.float64)
         result.append(compared(scan.model, points, scan.camera_from_part, grid))
     return result
@@ -317,7 +317,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     scans = load(settings.folder)
     grid = find_grid([scan.points for scan in scans], lowest_px=FOCAL_PX[0], highest_px=FOCAL_PX[1])
     real = [compared(scan.model, scan.points, scan.camera_from_part, grid) for scan in scans]
-    full = dataclasses.replace(sensors.consumer_depth(), camera=camera(grid))
+    full = dataclasses.replace(consumer_depth(), camera=camera(grid))
     if settings.fit:
         some, wanted = halves(scans)[0], statistics(halves(real)[0])
 

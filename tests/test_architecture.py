@@ -42,6 +42,7 @@ LAYERS = [
     "exposure",
     "range_errors",
     "sensor",
+    "measurement",
     "dataset",
     "inert_pickle",
     "torch_weights",

@@ -9,10 +9,11 @@ import pytest
 
 from experiments.disturbances import Disturbed, Series, make_series, saturating
 from vanejax.camera import hemisphere_viewpoints
+from vanejax.measurement import Reason, measure
 from vanejax.residuals import RayCasting
 from vanejax.rigid_transform import RigidTransform
 from vanejax.scanner import Scanner
-from vanejax.sensor import Reason, measure, preset
+from vanejax.sensor import preset
 from vanejax.surface import Surface
 from vanejax.vane import guide_vane
 

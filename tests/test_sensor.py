@@ -13,10 +13,11 @@ from scipy.special import erf
 from vanejax.camera import Camera, hemisphere_viewpoints, look_at
 from vanejax.errors import InputError
 from vanejax.exposure import Exposure
+from vanejax.measurement import Measurement, Reason, measure
 from vanejax.part import Part, part_from_mesh
 from vanejax.range_errors import Lens, Trueness, rim, windowed
 from vanejax.scanner import Scanner
-from vanejax.sensor import PRESETS, Measurement, Reason, Sensor, measure, preset
+from vanejax.sensor import PRESETS, Sensor, preset
 from vanejax.vane import guide_vane
 
 CAMERA = Camera(width=320, height=256, near_mm=100.0)

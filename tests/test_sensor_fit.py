@@ -23,10 +23,11 @@ from experiments.sensor_statistics import (
 )
 from vanejax.camera import Camera, field_of_view_deg, look_at
 from vanejax.errors import InputError
+from vanejax.measurement import measure
 from vanejax.part import part_from_mesh
 from vanejax.residuals import RayCasting
 from vanejax.scanner import Scanner
-from vanejax.sensor import Sensor, consumer_depth, measure
+from vanejax.sensor import Sensor, consumer_depth
 from vanejax.surface import Surface
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "real_scans"

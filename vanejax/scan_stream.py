@@ -19,13 +19,14 @@ import numpy as np
 
 from vanejax.camera import look_at
 from vanejax.errors import InputError
+from vanejax.measurement import measure
 from vanejax.normals import estimate_normals
 from vanejax.pairs import ScanBank
 from vanejax.part import Part
 from vanejax.pointcloud import PointCloud, voxel_thin
 from vanejax.rigid_transform import RigidTransform
 from vanejax.scanner import Scanner
-from vanejax.sensor import Sensor, measure
+from vanejax.sensor import Sensor
 
 # more than a log interval: the loop runs ahead of the device between two looks at its metrics
 STEPS_AHEAD = 16
