@@ -53,6 +53,7 @@ class Series:
       views: how many scans there are at each.
       take: ``take(value, number)`` makes scan ``number`` at this strength; same arguments, same
         bits.
+      max_allowance_mm: of the fine registration: how much stock it may find; 0 for none.
       paper: the paper's mean RMSE and FFMDE over this series, mm, where it has one (Fig. 11).
     """
 
@@ -62,6 +63,7 @@ class Series:
     values: Sequence[float]
     views: int
     take: Callable[[float, int], Disturbed]
+    max_allowance_mm: float = 0.0
     paper: tuple[float, float] | None = None
 
 
@@ -125,6 +127,15 @@ def make_series(part: Part, *, views: int, seed: int, sensor: str = "paper_camer
             (0.0, 0.25, 0.5, 0.75, 1.0),
             views,
             stand.as_cast,
+        ),
+        Series(
+            "stock",
+            "The same, stock estimated",
+            "mm",
+            (0.0, 0.25, 0.5, 0.75, 1.0),
+            views,
+            stand.as_cast,
+            max_allowance_mm=1.0,
         ),
         Series(
             "noise",

@@ -62,7 +62,9 @@ class Trial:
         self._normals = any_one.reference_normals
         self._voxel_mm = any_one.voxel_mm
 
-    def row(self, scan: Disturbed, rng: np.random.Generator) -> dict[str, Any]:
+    def row(
+        self, scan: Disturbed, rng: np.random.Generator, *, max_allowance_mm: float = 0.0
+    ) -> dict[str, Any]:
         """What every network finds in one scan, alone and refined, and the metrics at the truth."""
         truth = scan.part_from_camera
         init = _rough(truth, self.part, rng)
@@ -79,7 +81,7 @@ class Trial:
             found = match_poses(matcher, cloud, guess, iterations=matcher.iterations)
             matched = RigidTransform(found.rotation[0], found.translation[0])
             middle = time.perf_counter()
-            fine = refine(self._model, scan.points, matched)
+            fine = refine(self._model, scan.points, matched, max_allowance_mm=max_allowance_mm)
             end = time.perf_counter()
             row[name] = {
                 "alone": self._errors(scan, matched) | {"time_s": middle - began},
@@ -113,15 +115,13 @@ def _rough(truth: RigidTransform, part: Part, rng: np.random.Generator) -> Rigid
 
 def run_series(trial: Trial, series: Series, seed: int) -> dict[str, Any]:
     """All scans of a series."""
-    steps = []
     todo = [(value, number) for value in series.values for number in range(series.views)]
     rows: dict[float, list[dict[str, Any]]] = {value: [] for value in series.values}
     for value, number in tqdm(todo, series.name, unit="scan"):
         index = series.values.index(value)
         rng = np.random.default_rng([seed, _STARTS, index, number])
-        rows[value].append(trial.row(series.take(value, number), rng))
-    for value, found in rows.items():
-        steps.append({"value": value, "rows": found})
+        scan = series.take(value, number)
+        rows[value].append(trial.row(scan, rng, max_allowance_mm=series.max_allowance_mm))
     return {
         "name": series.name,
         "title": series.title,
@@ -129,7 +129,7 @@ def run_series(trial: Trial, series: Series, seed: int) -> dict[str, Any]:
         "paper": None
         if series.paper is None
         else {"rmse_mm": series.paper[0], "ffmde_abs_mm": series.paper[1]},
-        "steps": steps,
+        "steps": [{"value": value, "rows": found} for value, found in rows.items()],
     }
 
 

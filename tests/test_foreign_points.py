@@ -21,12 +21,15 @@ from example_scans import (
 
 from vanejax import foreign_points
 from vanejax.camera import Camera, hemisphere_viewpoints
+from vanejax.cli import main
 from vanejax.errors import InputError
 from vanejax.foreign_points import attempts, with_others, without_others
 from vanejax.locate import register
 from vanejax.measured_scan import MeasuredScan, clean_scan
+from vanejax.pose_file import read_pose
 from vanejax.pose_result import PoseResult
 from vanejax.rigid import RigidTransform
+from vanejax.scan_file import save_points
 from vanejax.scene import Clutter, clutter_scene
 from vanejax.segmentation import Segment, Segments
 
@@ -176,3 +179,19 @@ def test_of_rays_that_are_not_known_nothing_is_said():
     indices = dataclasses.replace(result.verification, checked=np.arange(100))
     result = dataclasses.replace(result, verification=indices)
     assert with_others(result, scan, segments, model(vane())).verdict is result.verdict
+
+
+def test_the_command_takes_the_part_out_of_its_scene(tmp_path, capsys) -> None:
+    scan, _, truth = cluttered()
+    save_points(tmp_path / "scan.ply", scan.points)
+    arguments = ["register", str(tmp_path / "scan.ply"), "vane", "--sensor-origin", "0,0,0"]
+    # with a table in it a scan is so large that nobody knows its unit
+    arguments += ["--json", str(tmp_path / "pose.json"), "--units-scan", "mm"]
+    main([*arguments, "--segment", "off"])
+    assert "taken away as a table" not in capsys.readouterr().out
+    assert main([*arguments, "--segment", "on"]) == 0
+    assert "taken away as a table" in " ".join(capsys.readouterr().out.split())
+    pose = read_pose(tmp_path / "pose.json")
+    assert max(pose_error(vane(), pose, truth)) < 0.15
+    assert main([*arguments, "--segment", "perhaps"]) == 2
+    assert "choose from" in capsys.readouterr().err

@@ -30,7 +30,7 @@ from vanejax.pose_search import (
     settle,
     starts,
 )
-from vanejax.refine import descend, refine, subset
+from vanejax.refine import check_allowance, descend, refine, subset, without_stock
 from vanejax.residuals import MeasurementModel, RayCasting, SurfaceMatching
 from vanejax.rigid_transform import RigidTransform
 from vanejax.scan_file import load_scan
@@ -68,6 +68,7 @@ def register(
     weights: TrainedMatcher | str | os.PathLike[str] | None = None,
     limits: Limits | None = None,
     segment: str = "auto",
+    max_allowance_mm: float = 0.0,
     seed: int = 0,
 ) -> PoseResult:
     """Finds where a part is in a scan, how sure that is, and whether to trust it.
@@ -92,11 +93,14 @@ def register(
       segment: whether table, clamps and chips are taken out of the scan first, see
         `vanejax.segmentation`: "off", "on", or "auto", which does so where the scan is not sound
         as it is, or has more than a third of other things. What touches the part may stay.
+      max_allowance_mm: for a casting with stock all over that its CAD model lacks: how much at
+        most. It is then estimated with the pose, see `vanejax.refine.refine`.
       seed: of all random subsets: same seed, same result.
 
     Raises:
       InputError: a file or a value that makes no sense; a part that the weights do not know.
     """
+    check_allowance(max_allowance_mm)
     seconds: dict[str, float] = {}
     with _timed(seconds, "read"):
         if not isinstance(part, Part):
@@ -114,33 +118,51 @@ def register(
             scan = load_scan(
                 scan, units=units_scan, part_extent_mm=part.extent_mm, sensor_origin=sensor_origin
             )
-    settings = (part, init, weights, limits, seed, seconds)
+    asked = _Asked(part, init, weights, limits or Limits(), max_allowance_mm, seed, seconds)
     results = []
     for segments in attempts(scan, part, segment, seed=seed):
         if segments is None:
-            result = _located(scan, *settings)
+            result = _located(scan, asked)
         else:
-            result = _located(without_others(scan, segments), *settings)
+            result = _located(without_others(scan, segments), asked)
             model = _model(scan, part)
-            result = with_others(result, scan, segments, model, limits=limits, seed=seed)
-        if _is_sound(result, limits):
+            result = with_others(result, scan, segments, model, limits=asked.limits, seed=seed)
+        if asked.is_sound(result):
             return result
         results.append(result)
     return max(results, key=lambda r: (STATUSES.index(r.verdict.status), r.verification.support))
 
 
-def _located(
-    scan: MeasuredScan,
-    part: Part,
-    init: RigidTransform | None,
-    weights: TrainedMatcher | None,
-    limits: Limits | None,
-    seed: int,
-    seconds: dict[str, float],
-) -> PoseResult:
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Asked:
+    """What `register` was asked, beside the scan, and the times it took so far."""
+
+    part: Part
+    init: RigidTransform | None
+    weights: TrainedMatcher | None
+    limits: Limits
+    max_allowance_mm: float
+    seed: int
+    seconds: dict[str, float]
+
+    def is_sound(self, result: PoseResult) -> bool:
+        """Whether a pose explains the scan so well that nothing else need be tried."""
+        return (
+            result.verdict.status != "rejected"
+            and result.verification.support >= self.limits.least_support
+        )
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Adds the wall time of a stage to ``seconds``."""
+        with _timed(self.seconds, name):
+            yield
+
+
+def _located(scan: MeasuredScan, asked: _Asked) -> PoseResult:
     """The pose of the part in a scan, also where the sensor's place turns out to be assumed."""
-    result = _locate(scan, part, init, weights, limits, seed, seconds, STARTS)
-    if scan.origin_is_assumed and not _is_sound(result, limits):
+    result = _locate(scan, asked, STARTS)
+    if scan.origin_is_assumed and not asked.is_sound(result):
         # perhaps the cloud was moved after it was taken: then the rays are wrong, not the pose
         merged = dataclasses.replace(
             scan,
@@ -151,38 +173,23 @@ def _located(
                 "sensor's place is taken as unknown",
             ),
         )
-        other = _locate(merged, part, init, None, limits, seed, seconds, STARTS[:1])
+        other = _locate(merged, dataclasses.replace(asked, weights=None), STARTS[:1])
         if other.verdict.status == "accepted":
             return other
     return result
 
 
-def _locate(
-    scan: MeasuredScan,
-    part: Part,
-    init: RigidTransform | None,
-    weights: TrainedMatcher | None,
-    limits: Limits | None,
-    seed: int,
-    seconds: dict[str, float],
-    counts: tuple[int, ...],
-) -> PoseResult:
+def _locate(scan: MeasuredScan, asked: _Asked, counts: tuple[int, ...]) -> PoseResult:
     """Tries sources of poses, cheapest first, until one is well supported."""
-    with _timed(seconds, "set up"):
-        model = _model(scan, part)
+    with asked.timed("set up"):
+        model = _model(scan, asked.part)
     results = []
-    for found in _sources(model, scan, init, weights, seed, seconds, counts):
-        result = _finish(model, scan, found, init, limits, seed, seconds)
-        if _is_sound(result, limits):
+    for found in _sources(model, scan, asked, counts):
+        result = _finish(model, scan, found, asked)
+        if asked.is_sound(result):
             return result
         results.append(result)
     return max(results, key=lambda result: result.verification.support)
-
-
-def _is_sound(result: PoseResult, limits: Limits | None) -> bool:
-    """Whether a pose explains the scan so well that no other source of poses need be tried."""
-    least = (limits or Limits()).least_support
-    return result.verdict.status != "rejected" and result.verification.support >= least
 
 
 def _model(scan: MeasuredScan, part: Part) -> MeasurementModel:
@@ -196,38 +203,36 @@ def _model(scan: MeasuredScan, part: Part) -> MeasurementModel:
 def _sources(
     model: MeasurementModel,
     scan: MeasuredScan,
-    init: RigidTransform | None,
-    weights: TrainedMatcher | None,
-    seed: int,
-    seconds: dict[str, float],
+    asked: _Asked,
     counts: tuple[int, ...],
 ) -> Iterator[Candidates]:
     """Candidates from the guess; else from RPM-Net; else from more and more rotations."""
-    points = scan.points
+    points, seed = scan.points, asked.seed
+    init, weights = asked.init, asked.weights
     if weights is not None:  # it brings JAX, which takes a second that others need not wait
         from vanejax.matched_poses import icosahedral_rotations, match_poses
     if init is not None:
         guesses = _batch(init)
         if weights is not None:
-            with _timed(seconds, "match"):
+            with asked.timed("match"):
                 matched = match_poses(
                     weights, scan, guesses, iterations=weights.iterations, seed=seed
                 )
             guesses = concatenate(guesses, matched)
-        with _timed(seconds, "search"):
+        with asked.timed("search"):
             found = settle(model, points, guesses, seed=seed)
         yield found
         return
     if weights is not None:
-        with _timed(seconds, "match"):
+        with asked.timed("match"):
             some = points[subset(points, RIVAL_POINTS, seed)]
             guesses = starts(model, some, icosahedral_rotations())
             matched = match_poses(weights, scan, guesses, iterations=MATCH_ITERATIONS, seed=seed)
-        with _timed(seconds, "search"):
+        with asked.timed("search"):
             found = search(model, points, extra=matched, count=0, seed=seed)
         yield found
     for attempt, count in enumerate(counts):
-        with _timed(seconds, "search"):
+        with asked.timed("search"):
             found = search(model, points, count=count, seed=seed + attempt)
         yield found
 
@@ -236,14 +241,12 @@ def _finish(
     model: MeasurementModel,
     scan: MeasuredScan,
     found: Candidates,
-    init: RigidTransform | None,
-    limits: Limits | None,
-    seed: int,
-    seconds: dict[str, float],
+    asked: _Asked,
 ) -> PoseResult:
     """Challenges, compares, refines, verifies and judges the best of the candidates."""
-    part, points, limits = model.part, scan.points, limits or Limits()
-    with _timed(seconds, "challenge"):
+    part, points = asked.part, scan.points
+    init, limits, seed = asked.init, asked.limits, asked.seed
+    with asked.timed("challenge"):
         pool = challenge(model, points, found, seed=seed)
         some = points[subset(points, RIVAL_POINTS, seed + 2)]
         poses, _ = descend(
@@ -263,16 +266,26 @@ def _finish(
             total[(turn < GUESS_DEG) & (shift < GUESS_SHIFT * part.radius)] += 10
         order = np.argsort(-total, kind="stable")
         poses = select(poses, order[distinct(select(poses, order), part, len(order))])
-    with _timed(seconds, "refine"):
-        refinement = refine(model, points, select(poses, 0), seed=seed)
+    with asked.timed("refine"):
+        refinement = refine(
+            model,
+            points,
+            select(poses, 0),
+            seed=seed,
+            max_allowance_mm=asked.max_allowance_mm,
+        )
         pose = refinement.part_from_camera
-    with _timed(seconds, "verify"):
+    with asked.timed("verify"):
         poses = concatenate(_batch(pose), select(poses, slice(1, None)))
         tolerance = float(inlier_tolerance_mm(model, _batch(pose), some)[0])
         said = evidence(model, poses, some, tolerance_mm=tolerance, view=view)
         checked = subset(points, VERIFIED_POINTS, seed + 3)
+        bare, within = points, tolerance
+        if refinement.allowance_mm:  # what is asked is whether the part is there under its stock
+            bare = without_stock(model, points, pose, refinement.allowance_mm)
+            within = float(inlier_tolerance_mm(model, _batch(pose), bare[checked])[0])
         verification = verify(
-            model, pose, points, checked, tolerance_mm=tolerance, view=_view(scan, points[checked])
+            model, pose, bare, checked, tolerance_mm=within, view=_view(scan, bare[checked])
         )
     sure = uncertainty(refinement, part.center)
     turn, shift = distances(poses, pose, part)
@@ -299,7 +312,7 @@ def _finish(
         before=found.pose(0) if init is None else init,
         sensor_origin=scan.sensor_origin,
         notes=tuple(notes),
-        seconds=seconds,
+        seconds=asked.seconds,
     )
 
 

@@ -158,6 +158,8 @@ def result_to_dict(
                 "points": refinement.num_points,
                 "inliers": refinement.num_inliers,
                 "information": refinement.information,
+                "allowance_mm": refinement.allowance_mm,
+                "allowance_sigma_mm": refinement.allowance_sigma_mm,
             },
             "alternatives": alternatives,
             "before_refinement": {"part_from_camera": result.before.as_matrix()},

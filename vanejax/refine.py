@@ -120,11 +120,7 @@ def refine(
     Raises:
       InputError: a negative or infinite ``max_allowance_mm``.
     """
-    if not 0 <= max_allowance_mm < np.inf:
-        raise InputError(
-            f"max_allowance_mm must be 0 mm or more and finite, got {max_allowance_mm!r}; "
-            "1 mm is usual for an investment casting"
-        )
+    check_allowance(max_allowance_mm)
     batch = RigidTransform(init.rotation[None], init.translation[None])
     coarse = points[subset(points, COARSE_POINTS, seed)]
     batch, iterations = descend(model, batch, coarse, iterations=25, settled_deg=0.02)
@@ -165,6 +161,15 @@ def refine(
     )
 
 
+def check_allowance(max_allowance_mm: float) -> None:
+    """Raises InputError for a length that stock cannot have."""
+    if not 0 <= max_allowance_mm < np.inf:
+        raise InputError(
+            f"max_allowance_mm must be 0 mm or more and finite, got {max_allowance_mm!r}; "
+            "1 mm is usual for an investment casting"
+        )
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Polished:
     """The end of `_polish`; the pose has a leading axis of 1."""
@@ -193,7 +198,8 @@ def _polish(
     weight = np.full(len(points), np.inf)
     bare = points
     if allowance:
-        bare = _bare(points, allowance, model.residuals(batch, points), batch)
+        pose = RigidTransform(batch.rotation[0], batch.translation[0])
+        bare = without_stock(model, points, pose, allowance)
     for step in range(max_iterations):
         now = model.residuals(batch, bare)
         columns = now.jacobian[0]
@@ -234,6 +240,17 @@ def _polish(
         allowance_mm=allowance,
         allowance_sigma_mm=allowance_sigma,
     )
+
+
+def without_stock(
+    model: MeasurementModel, points: np.ndarray, part_from_camera: RigidTransform, allowance: float
+) -> np.ndarray:
+    """Points [n, 3] mm, camera frame, moved inward by ``allowance`` mm along the normals at a pose.
+
+    Those of the faces that the model predicts for them under ``part_from_camera``, one pose.
+    """
+    batch = RigidTransform(part_from_camera.rotation[None], part_from_camera.translation[None])
+    return _bare(points, allowance, model.residuals(batch, points), batch)
 
 
 def _bare(

@@ -57,6 +57,11 @@ def summary(result: PoseResult, *, color: bool, seconds: Mapping[str, float]) ->
         f"{refinement.iterations} iterations, {ended}, "
         f"{refinement.num_inliers:,} of {refinement.num_points:,} points",
     ]
+    if refinement.allowance_sigma_mm:
+        lines.append(
+            f"  stock        {_number(refinement.allowance_mm)} mm all over, sigma "
+            f"{_number(refinement.allowance_sigma_mm)} mm"
+        )
     if result.alternatives:
         lines.append("alternatives (from the pose above)")
     for number, other in enumerate(result.alternatives, 1):

@@ -54,6 +54,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="take table, clamps and chips out of the scan first: auto (default) does so where "
         "the scan does not do as it is",
     )
+    parser.add_argument(
+        "--max-allowance-mm",
+        type=float,
+        default=0.0,
+        metavar="MM",
+        help="for a casting: how much stock it has all over at most; it is then estimated (0)",
+    )
     parser.add_argument("--json", metavar="FILE", help="write the pose and all figures here")
     parser.add_argument("--report", metavar="FILE", help="write an HTML report here")
     parser.add_argument("--seed", type=int, default=0, help="of what is drawn at random (0)")
@@ -98,7 +105,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     prepared = time.perf_counter()
     result = register(
-        scan, part, init=init, weights=matcher, segment=arguments.segment, seed=arguments.seed
+        scan,
+        part,
+        init=init,
+        weights=matcher,
+        segment=arguments.segment,
+        max_allowance_mm=arguments.max_allowance_mm,
+        seed=arguments.seed,
     )
     ended = time.perf_counter()
     color = wants_color()
