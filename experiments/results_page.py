@@ -1,10 +1,9 @@
-"""Puts the recorded results of the comparisons into README.md and docs/comparison.md.
+"""Puts recorded results into README.md and the pages of docs/ that tell of them.
 
 python -m experiments.results_page
 
-Run it after copying comparison.json, tuning.json, public_vs_virtual.json, density.json or an
-ablation.json of a run to experiments/results (`NAMES` says under which name); a test checks that
-the pages are current.
+Run it after copying a run's JSON to experiments/results (`NAMES` says under which name) and its
+pictures to docs; a test checks that the pages are current.
 """
 
 from __future__ import annotations
@@ -14,7 +13,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments import ablation_table, comparison_table, density_report, public_vs_virtual
+from experiments import (
+    ablation_table,
+    comparison_table,
+    density_report,
+    public_vs_virtual,
+    robustness_report,
+    sensor_fit,
+)
 from experiments.marked_page import with_block
 from experiments.methods import TITLES
 from vanejax.whole_file import write_text
@@ -22,6 +28,8 @@ from vanejax.whole_file import write_text
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "experiments" / "results"
 README, DETAILS = ROOT / "README.md", ROOT / "docs" / "comparison.md"
+ROBUSTNESS, REAL_SCANS = ROOT / "docs" / "robustness.md", ROOT / "docs" / "real_scans.md"
+PAGES = (README, DETAILS, ROBUSTNESS, REAL_SCANS)
 NAMES = (
     "vane",
     "comparison",
@@ -30,6 +38,8 @@ NAMES = (
     "density",
     "ablation_neighbors",
     "ablation_noise",
+    "robustness",
+    "sensor_fit",
 )
 Report = Mapping[str, Any]
 
@@ -161,6 +171,11 @@ def blocks(results: Mapping[str, Report]) -> dict[Path, dict[str, str]]:
                 "ablation_noise", lambda report: text_block(ablation_table.table(report))
             ),
         },
+        ROBUSTNESS: {
+            "random": robustness_report.random_lines(results["robustness"]["random"]),
+            "series": dated("robustness", robustness_report.markdown),
+        },
+        REAL_SCANS: {"table": dated("sensor_fit", sensor_fit.table)},
     }
 
 
@@ -173,9 +188,9 @@ def page(path: Path, results: Mapping[str, Report]) -> str:
 
 
 def main() -> None:
-    """Rewrites both pages."""
+    """Rewrites the pages."""
     results = recorded()
-    for path in (README, DETAILS):
+    for path in PAGES:
         write_text(path, page(path, results))
 
 

@@ -1,4 +1,4 @@
-"""README.md and docs/comparison.md say what the recorded results say."""
+"""The pages say what the recorded results say."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import pytest
 
 from experiments.marked_page import with_block
 from experiments.results_page import (
-    DETAILS,
     NAMES,
-    README,
+    PAGES,
     RESULTS,
     blocks,
     brief_table,
@@ -21,13 +20,13 @@ from experiments.results_page import (
 )
 
 
-@pytest.mark.parametrize("path", [README, DETAILS], ids=lambda path: path.name)
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
 def test_the_pages_are_current(path) -> None:
     """If this is red: python -m experiments.results_page"""
     assert page(path, recorded()) == path.read_text()
 
 
-@pytest.mark.parametrize("path", [README, DETAILS], ids=lambda path: path.name)
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
 def test_every_picture_of_the_pages_is_there(path) -> None:
     pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", path.read_text())
     assert pictures

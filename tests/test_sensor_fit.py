@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from experiments import sensor_fit, sensor_fit_page
+from experiments import results_page, sensor_fit
 from experiments.sensor_statistics import (
     Compared,
     Grid,
@@ -249,22 +248,14 @@ def test_the_fitted_sensor_is_liker_to_real_scans_than_an_ideal_one():
     assert distance(wanted, ideal) > 2
 
 
-def test_the_page_is_current():
-    """If this is red: python -m experiments.sensor_fit_page"""
-    page = sensor_fit_page.PAGE.read_text()
-    assert sensor_fit_page.page(page, sensor_fit_page.recorded()) == page
-    for name in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", page):
-        assert (sensor_fit_page.PAGE.parent / name).stat().st_size > 10_000
-
-
 def test_the_preset_is_what_was_fitted():
-    recorded, preset = sensor_fit_page.recorded()["sensor"], consumer_depth()
+    recorded, preset = results_page.recorded()["sensor_fit"]["sensor"], consumer_depth()
     for name, value in recorded.items():
         assert getattr(preset, name) == pytest.approx(value, rel=1e-5), name
 
 
 def test_the_table_follows_the_figures():
-    report = sensor_fit_page.recorded()
+    report = results_page.recorded()["sensor_fit"]
     before = sensor_fit.table(report)
     report["virtual"]["all"]["distance_held_out"] = 12.34
     assert "12.34" in sensor_fit.table(report)
