@@ -112,6 +112,7 @@ LAYERS = [
     "plotting.scene",
     "plotting.deviation",
     "plotting.casting",
+    "plotting.sensing",
     "plotting.segments",
     "plotting",
     "report.wording",
