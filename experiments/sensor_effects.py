@@ -4,8 +4,9 @@ python -m experiments.sensor_effects [--view 50] [--views 27] [--repeats 3] [--o
 
 The guide vane by the paper's camera with one effect at a time, then with all that it has (a stereo
 camera's matching window is shown besides). Holes are the pixels that are not measured, rms is how
-far the points stand off the true surface along its normal. Times are those of scanning ``--views`` viewpoints on all cores, as ratios to ideal scanning in the same run. Results:
-a table, sensor_effects.json and sensor_effects.png in ``--out``.
+far the points stand off the true surface along its normal. Times are those of scanning ``--views``
+viewpoints on all cores, as ratios to ideal scanning in the same run. Results: a table,
+sensor_effects.json and sensor_effects.png in ``--out``.
 """
 
 from __future__ import annotations
