@@ -180,6 +180,19 @@ def test_noise_has_the_variance_of_triangulation():
         np.testing.assert_allclose(errors.mean(), 0, atol=4 * sigma / np.sqrt(len(errors)) + 1e-4)
 
 
+def test_noise_grows_where_less_light_comes_back(plate):
+    """Shot noise: half the exposure gives sqrt(2) times the noise, at every pixel."""
+
+    def spread(exposure_ms: float) -> float:
+        exposure = Exposure(exposure_ms=exposure_ms, ambient_per_ms=0.0, least_modulation=0.01)
+        return depth_error(
+            take(plate, Sensor(camera=CAMERA, noise_px=0.05, exposure=exposure))
+        ).std()
+
+    # the same draws twice: the ratio has no error of sampling but rounding
+    assert spread(5.0) / spread(10.0) == pytest.approx(np.sqrt(2), rel=1e-3)
+
+
 def test_correlated_noise_is_smooth_white_noise_is_not(plate):
     def neighbor_correlation(sensor: Sensor) -> float:
         scan = take(plate, sensor)
@@ -321,6 +334,10 @@ def test_fewer_pixels_leave_the_errors_in_mm(plate):
         small = sensor.scaled(factor)
         assert small.camera.width == sensor.camera.width * factor
         assert small.range_sigma_mm(400.0) == pytest.approx(sensor.range_sigma_mm(400.0))
+        # in mm an error of the disparity is z^2 / (f b) of it, and a length in the image z / f
+        for name in ("correlated_px", "correlation_px", "step_px"):
+            mine, theirs = (getattr(s, name) / s.camera.fx for s in (small, sensor))
+            assert mine == pytest.approx(theirs), name
 
 
 @pytest.mark.parametrize(

@@ -188,7 +188,6 @@ class _Sensing:
         sensor, scan = self.sensor, self.scan
         points, normals = scan.points, scan.normals
         to_projector = np.float32([sensor.baseline_mm, 0, 0]) - points
-        lit = np.ones(len(points), bool)
         if sensor.shadow:
             lit = self.scanner.lit(points, normals, to_projector, scan.camera_from_part)
             self._drop(~lit, Reason.SHADOWED)
@@ -204,9 +203,9 @@ class _Sensing:
                 least = np.float32(math.cos(math.radians(sensor.most_incidence_deg)))
             self._drop(cosine < least, Reason.GRAZING)
         if sensor.exposure is not None:
-            self._expose(sensor.exposure, to_projector, lit)
+            self._expose(sensor.exposure, to_projector)
 
-    def _expose(self, exposure: Exposure, to_projector: np.ndarray, lit: np.ndarray) -> None:
+    def _expose(self, exposure: Exposure, to_projector: np.ndarray) -> None:
         scan = self.scan
         to_camera = -scan.points
         to_camera /= np.sqrt(np.einsum("ni,ni->n", to_camera, to_camera))[:, None]
@@ -214,7 +213,6 @@ class _Sensing:
         way = to_projector / distance[:, None]
         shine = exposure.reflected(scan.normals, to_camera, way)
         modulation = exposure.modulation(shine, distance)
-        modulation[~lit] = 0
         total = modulation
         if exposure.ambient_per_ms:
             lamp = np.float32(exposure.ambient_towards)
