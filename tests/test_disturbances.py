@@ -7,12 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from experiments import disturbances
 from experiments.disturbances import Disturbed, Series, make_series, saturating
 from vanejax.camera import hemisphere_viewpoints
 from vanejax.measurement import Reason, measure
 from vanejax.residuals import RayCasting
 from vanejax.rigid_transform import RigidTransform
 from vanejax.scanner import Scanner
+from vanejax.segmentation import Segment, Segments
 from vanejax.sensor import preset
 from vanejax.surface import Surface
 from vanejax.vane import guide_vane
@@ -98,3 +100,27 @@ def test_correlated_noise_is_what_is_asked_for(series, model):
         for pixels in (0.0, 0.2)
     )
     assert loud > 1.5 * quiet
+
+
+def test_a_table_that_stays_counts_as_foreign(series, monkeypatch):
+    def everything(points, part, **_):
+        return Segments(np.full(len(points), Segment.PART, np.uint8), ())
+
+    monkeypatch.setattr(disturbances, "segment", everything)
+    scan = series["fixture"].take(0.0, 0)  # the table is all there is beside the part
+    assert len(scan.points) == len(scan.measured.points)
+    on_table = np.isclose(deviations_from_table_mm(scan), 0, atol=1.0).mean()
+    assert scan.foreign_share == pytest.approx(on_table, abs=0.03)
+    assert scan.foreign_share > 0.3
+
+
+def deviations_from_table_mm(scan: Disturbed) -> np.ndarray:
+    """[N] heights above the plane that most of the outer pixels lie on, least squares, trimmed."""
+    points = scan.points
+    outer = points[np.linalg.norm(points[:, :2], axis=1) > 75]
+    for _ in range(5):
+        middle = outer.mean(axis=0)
+        normal = np.linalg.svd(outer - middle, full_matrices=False)[2][2]
+        height = (outer - middle) @ normal
+        outer = outer[np.abs(height) <= max(0.5, 2 * np.median(np.abs(height)))]
+    return (points - middle) @ normal

@@ -384,6 +384,27 @@ def test_a_network_that_finds_nothing_does_no_harm(monkeypatch):
     assert_right(result, bracket(), truth)
 
 
+def test_the_network_is_not_asked_about_a_scan_whose_rays_are_wrong(monkeypatch):
+    """It was trained on normals that face the sensor, whose place is then unknown."""
+    points, truth = scan_of("bracket", 1)
+    frame = turned_in_place(points, [120.0, 0.0, 0.0])
+    init = disturbed(bracket(), truth @ frame.inverse(), 3, 3, seed=0)
+    origins = []
+
+    def as_guessed(matcher, scan, guesses, *, iterations, seed):
+        origins.append(scan.sensor_origin)
+        return guesses
+
+    monkeypatch.setattr(matched_poses, "match_poses", as_guessed)
+    result = register(
+        frame.apply(points), bracket(), weights=a_matcher(bracket()), init=init, segment="off"
+    )
+    assert result.verdict.status == "accepted"
+    assert result.sensor_origin is None
+    assert len(origins) == 1
+    assert origins[0] is not None
+
+
 # --- what makes no sense ------------------------------------------------------------------------
 
 NOT_POSES = {

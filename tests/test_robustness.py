@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from experiments import robustness_report
-from experiments.robustness import make_parser, parse_weights, summarize_random
+from experiments import robustness, robustness_report
+from experiments.disturbances import make_series
+from experiments.robustness import Trial, make_parser, parse_weights, run_series, summarize_random
+from experiments.vane_views import beside
 from vanejax.errors import InputError
 from vanejax.plotting.canvas import save_figure
+from vanejax.vane import guide_vane
 
 
 def row(deg: float, mm: float) -> dict[str, Any]:
@@ -126,3 +131,51 @@ def test_weights_keep_their_order():
 
 def test_the_report_is_plain_json(report):
     assert json.loads(json.dumps(report)) == report
+
+
+@pytest.fixture
+def trial(monkeypatch) -> Trial:
+    """A network that answers with its guess, and guesses that are nearly right."""
+    part = guide_vane()
+    points, normals, _ = part.sample(20_000, seed=0)
+    network = SimpleNamespace(
+        iterations=1, reference_points=points, reference_normals=normals, voxel_mm=2.0
+    )
+    monkeypatch.setattr(robustness, "match_poses", lambda matcher, scan, guess, **_: guess)
+    monkeypatch.setattr(
+        robustness, "_rough", lambda truth, part, rng: beside(truth, part, deg=1, mm=1, rng=rng)
+    )
+    return Trial(part, {"guess": network})
+
+
+def test_a_series_is_refined_and_stock_is_found_where_it_says_so(trial):
+    every = {one.name: one for one in make_series(trial.part, views=3, seed=0)}
+    found = {}
+    for name in ("casting", "stock"):
+        report = run_series(trial, dataclasses.replace(every[name], values=(1.0,)), seed=0)
+        (step,) = report["steps"]
+        assert step["value"] == 1.0
+        for row in step["rows"]:
+            assert row["guess"]["alone"]["rotation_deg"] == pytest.approx(1.0)
+            assert row["guess"]["alone"]["translation_mm"] == pytest.approx(1.0)
+        found[name] = step["rows"]
+    # the same scans from the same starts: castings with 0.5 mm of stock, and waves on it
+    points = ([row["points"] for row in rows] for rows in found.values())
+    assert next(points) == next(points)
+    without, with_stock = (
+        np.mean([row["guess"]["refined"]["translation_mm"] for row in rows])
+        for rows in found.values()
+    )
+    assert without > 0.4
+    assert with_stock < 0.7 * without  # the waves stay
+
+
+def test_refinement_is_what_the_table_says_it_is(trial):
+    series = {one.name: one for one in make_series(trial.part, views=1, seed=0)}["noise"]
+    report = run_series(trial, dataclasses.replace(series, values=(0.0,)), seed=0)
+    (row,) = report["steps"][0]["rows"]
+    fine = row["guess"]["refined"]
+    assert fine["rotation_deg"] < 0.1
+    assert fine["translation_mm"] < 0.15
+    assert fine["ffmde_abs_mm"] == pytest.approx(row["truth"]["ffmde_abs_mm"], abs=0.02)
+    assert row["foreign_share"] == 0
