@@ -193,7 +193,7 @@ def _panel(axes: Axes, report: Report, series: Report, name: str) -> None:
                 axes.fill_between(strengths, low, high, color=color, alpha=0.12, linewidth=0)
     if name in METRICS:
         floor = [
-            float(np.mean([r["truth"][name] for r in step["rows"]])) for step in series["steps"]
+            float(np.median([r["truth"][name] for r in step["rows"]])) for step in series["steps"]
         ]
         axes.plot(strengths, floor, ":", color=INK, linewidth=1.3, label="at the true pose")
         if series["paper"] is not None:
