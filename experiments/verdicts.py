@@ -87,8 +87,10 @@ def assess(
     The steps, and the numbers of points, are those of `vanejax.locate`.
     """
     part = model.part
-    poses = _batch([*(found.part_from_camera for found in refined), *rivals])
     some = points[subset(points, locate.RIVAL_POINTS, 2)]
+    # a refined pose may have slid where the scan hardly holds it: no fair rival
+    poses = _batch([*(found.part_from_camera for found in refined), *rivals])
+    poses = locate.followed(model, poses, some)
     checked = subset(points, locate.VERIFIED_POINTS, 3)
     few, all_checked = View(some, model.sensor_origin), View(points[checked], model.sensor_origin)
     result = []

@@ -249,15 +249,7 @@ def _finish(
     with asked.timed("challenge"):
         pool = challenge(model, points, found, seed=seed)
         some = points[subset(points, RIVAL_POINTS, seed + 2)]
-        poses, _ = descend(
-            model,
-            select(pool.part_from_camera, slice(0, 1 + RIVALS)),
-            some,
-            iterations=8,
-            feet="samples",
-            floor_mm=LEAST_TOLERANCE * part.radius,
-            settled_deg=0.02,
-        )
+        poses = followed(model, select(pool.part_from_camera, slice(0, 1 + RIVALS)), some)
         view = _view(scan, some)
         level = float(inlier_tolerance_mm(model, poses, some).min())
         total = evidence(model, poses, some, tolerance_mm=level, view=view).total
@@ -346,6 +338,19 @@ def _alternative(
         translation_mm=rival.translation_mm,
         inlier_share=float(np.mean(np.abs(deviation) <= tolerance_mm)),
     )
+
+
+def followed(model: MeasurementModel, poses: RigidTransform, points: np.ndarray) -> RigidTransform:
+    """H poses [H, 3, 3] followed to where they explain the points [n, 3] best: to be compared."""
+    return descend(
+        model,
+        poses,
+        points,
+        iterations=8,
+        feet="samples",
+        floor_mm=LEAST_TOLERANCE * model.part.radius,
+        settled_deg=0.02,
+    )[0]
 
 
 def inlier_tolerance_mm(
