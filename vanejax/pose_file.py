@@ -5,6 +5,7 @@ Frames and units are stated in the file itself. Host numpy only.
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import importlib.metadata
 import json
@@ -12,12 +13,12 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from vanejax.errors import InputError
-from vanejax.pose_result import PointStatus, PoseResult, Uncertainty, Verification
+from vanejax.pose_result import PointStatus, PoseResult, Status, Uncertainty, Verdict, Verification
 from vanejax.rigid_transform import RigidTransform
 from vanejax.whole_file import write_text
 
@@ -60,15 +61,25 @@ def pose_to_dict(part_from_camera: RigidTransform) -> dict[str, Any]:
     matrices = {name: np.asarray(pose.as_matrix(), np.float64) for name, pose in poses.items()}
     found: dict[str, Any] = {name: matrix.tolist() for name, matrix in matrices.items()}
     for name, matrix in matrices.items():
-        rotation, (x, y, z) = matrix[:3, :3], matrix[:3, 3].tolist()
-        a, b, c = euler_xyz_deg(rotation).tolist()
+        rotation = matrix[:3, :3]
         found[f"{name}_as"] = {
-            "translation_mm": [x, y, z],
+            "translation_mm": matrix[:3, 3].tolist(),
             "quaternion_wxyz": quaternion_wxyz(rotation).tolist(),
-            "euler_xyz_deg": [a, b, c],
-            "kuka": {"X": x, "Y": y, "Z": z, "A": c, "B": b, "C": a},
+            "euler_xyz_deg": euler_xyz_deg(rotation).tolist(),
+            "kuka": kuka_frame(poses[name]),
         }
     return found
+
+
+def kuka_frame(pose: RigidTransform) -> dict[str, float]:
+    """X, Y, Z in mm and A, B, C in degrees of KUKA's FRAME: R = Rz(A) Ry(B) Rx(C).
+
+    A turns about z, B about the y so turned, C about the x turned twice (KUKA System Software,
+    operating and programming instructions). B is within -90 to 90; at either end A is 0.
+    """
+    x, y, z = np.asarray(pose.translation, np.float64).tolist()
+    a, b, c = euler_xyz_deg(pose.rotation).tolist()
+    return {"X": x, "Y": y, "Z": z, "A": c, "B": b, "C": a}
 
 
 def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
@@ -97,11 +108,14 @@ def euler_xyz_deg(rotation: np.ndarray) -> np.ndarray:
     """`vanejax.rigid.euler_xyz_deg` for one rotation [3, 3], in float64 on the host."""
     r = np.asarray(rotation, np.float64)
     cosine = np.hypot(r[0, 0], r[1, 0])
-    b = np.arctan2(-r[2, 0], cosine)
-    if cosine < 10 * np.finfo(np.float64).eps:
-        # only a - c or a + c is defined: c is 0
-        return np.degrees([np.arctan2(-r[1, 2], r[1, 1]), b, 0.0])
-    return np.degrees([np.arctan2(r[2, 1], r[2, 2]), b, np.arctan2(r[1, 0], r[0, 0])])
+    # below rounding only a - c or a + c is defined: c is 0
+    c = 0.0 if cosine < 10 * np.finfo(np.float64).eps else np.arctan2(r[1, 0], r[0, 0])
+    # of what is left when c is taken back: near b = 90 deg the error of c is in a as well, and the
+    # three together are right to rounding
+    a = np.arctan2(
+        np.sin(c) * r[0, 2] - np.cos(c) * r[1, 2], np.cos(c) * r[1, 1] - np.sin(c) * r[0, 1]
+    )
+    return np.degrees([a, np.arctan2(-r[2, 0], cosine), c])
 
 
 def result_to_dict(
@@ -184,6 +198,43 @@ def write_result(path: str | os.PathLike[str], result: PoseResult, **names: Any)
     write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class PoseRecord:
+    """What a pose file says that is needed to act on it.
+
+    Attributes:
+      part_from_camera: the pose, f64, mm.
+      verdict: of the registration; None where the file has none, such as one typed by hand.
+      part_sha256: `Part.sha256` of the part that was found; None where the file has none.
+    """
+
+    part_from_camera: RigidTransform
+    verdict: Verdict | None
+    part_sha256: str | None
+
+
+def read_record(path: str | os.PathLike[str]) -> PoseRecord:
+    """`read_pose`, with the verdict on it where the file has one.
+
+    Raises:
+      InputError: as `read_pose`; or the verdict is none of accepted, ambiguous, rejected.
+    """
+    path = Path(path)
+    text = read_text(path)
+    pose = parse_transform(text, where=str(path))
+    values = json.loads(text) if text.lstrip()[:1] == "{" else {}
+    verdict, part = values.get("verdict"), values.get("part")
+    if verdict is not None:
+        if not isinstance(verdict, dict) or verdict.get("status") not in get_args(Status):
+            raise InputError(
+                f"{path}: its verdict has no status {', '.join(get_args(Status))}; "
+                "write it again with `vanejax register --json`"
+            )
+        verdict = Verdict(verdict["status"], str(verdict.get("reason") or "no reason is given"))
+    sha256 = part.get("sha256") if isinstance(part, dict) else None
+    return PoseRecord(pose, verdict, sha256 if isinstance(sha256, str) else None)
+
+
 def read_pose(path: str | os.PathLike[str]) -> RigidTransform:
     """Reads part_from_camera, for example as a first guess.
 
@@ -198,20 +249,35 @@ def read_pose(path: str | os.PathLike[str]) -> RigidTransform:
     Raises:
       InputError: no such file, no pose in it, or no rigid motion; names the file and the value.
     """
-    path = Path(path)
-    text = _read_text(path)
+    return parse_transform(read_text(Path(path)), where=str(path))
+
+
+def parse_transform(
+    text: str, *, where: str, target: str = "part", source: str = "camera"
+) -> RigidTransform:
+    """The motion between any two frames from text that `read_pose` takes.
+
+    Args:
+      text: JSON or 16 numbers.
+      where: what the message of an error starts with.
+      target, source: names of the frames, in place of part and camera in the names of JSON; what
+        stands without a name is target_from_source.
+
+    Raises:
+      InputError: as `read_pose`.
+    """
     if text.lstrip()[:1] in ("{", "["):
-        return _from_json(text, path)
+        return _from_json(text, where, target, source)
     words = re.sub(r"#.*", "", text).replace(",", " ").replace(";", " ").split()
     try:
         numbers = [float(word) for word in words[:17]]
     except ValueError as error:
-        raise InputError(f"{path}: neither JSON nor 16 numbers ({error})") from None
+        raise InputError(f"{where}: neither JSON nor 16 numbers ({error})") from None
     if len(words) != 16:
         raise InputError(
-            f"{path}: holds {len(words)} numbers; a pose is 16, the rows of a 4x4 matrix in mm"
+            f"{where}: holds {len(words)} numbers; a pose is 16, the rows of a 4x4 matrix in mm"
         )
-    return rigid_from_matrix(np.array(numbers).reshape(4, 4), where=str(path))
+    return rigid_from_matrix(np.array(numbers).reshape(4, 4), where=where)
 
 
 def rigid_from_matrix(matrix: np.ndarray, *, where: str) -> RigidTransform:
@@ -256,7 +322,12 @@ def rigid_from_matrix(matrix: np.ndarray, *, where: str) -> RigidTransform:
     return RigidTransform(rotation=u @ vt, translation=matrix[:3, 3].copy())
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """The text of a pose file.
+
+    Raises:
+      InputError: no such file, no text, or too large to be a pose.
+    """
     try:
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: is a folder or a device; a pose file is JSON or 16 numbers")
@@ -274,42 +345,40 @@ def _read_text(path: Path) -> str:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def _from_json(text: str, path: Path) -> RigidTransform:
+def _from_json(text: str, where: str, target: str, source: str) -> RigidTransform:
     try:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is not valid JSON ({error})") from None
+        raise InputError(f"{where}: is not valid JSON ({error})") from None
     if isinstance(values, list):
-        return rigid_from_matrix(_matrix(values, str(path)), where=str(path))
+        return rigid_from_matrix(_matrix(values, where), where=where)
+    forward, backward = f"{target}_from_{source}", f"{source}_from_{target}"
     poses = {
-        name: rigid_from_matrix(_matrix(values[name], f"{path}, {name}"), where=f"{path}, {name}")
-        for name in ("part_from_camera", "camera_from_part")
+        name: rigid_from_matrix(_matrix(values[name], f"{where}, {name}"), where=f"{where}, {name}")
+        for name in (forward, backward)
         if name in values
     }
     if not poses:
         there = ", ".join(map(repr, list(values)[:8])) or "nothing"
         raise InputError(
-            f'{path}: has no "part_from_camera" and no "camera_from_part", each 4x4, row-major, '
+            f'{where}: has no "{forward}" and no "{backward}", each 4x4, row-major, '
             f"mm; it has {there}"
         )
     if len(poses) == 2:
-        _check_inverse(poses["part_from_camera"], poses["camera_from_part"], path)
-    if "part_from_camera" in poses:
-        return poses["part_from_camera"]
-    return poses["camera_from_part"].inverse()
+        _check_inverse(poses[forward], poses[backward], f'{where}: "{forward}" and "{backward}"')
+    if forward in poses:
+        return poses[forward]
+    return poses[backward].inverse()
 
 
-def _check_inverse(one: RigidTransform, other: RigidTransform, path: Path) -> None:
+def _check_inverse(one: RigidTransform, other: RigidTransform, names: str) -> None:
     """Refuses a file in which only one of the two matrices was edited."""
     rest = one @ other
     # rounded entries of a rotation move a point that is far away
     limit = MATRIX_TOLERANCE * (1 + np.linalg.norm(one.translation))
     turned = np.abs(rest.rotation - np.eye(3)).max() > MATRIX_TOLERANCE
     if turned or np.abs(rest.translation).max() > limit:
-        raise InputError(
-            f'{path}: "part_from_camera" and "camera_from_part" are not inverse to each other; '
-            "keep the one that is right"
-        )
+        raise InputError(f"{names} are not inverse to each other; keep the one that is right")
 
 
 def _matrix(value: Any, where: str) -> np.ndarray:
