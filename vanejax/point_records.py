@@ -26,6 +26,7 @@ NORMAL_NAMES = (
     ("normal_x", "normal_y", "normal_z"),
     ("normalx", "normaly", "normalz"),
     ("normals:0", "normals:1", "normals:2"),
+    ("i", "j", "k"),  # of measuring machines and tool paths
 )
 
 
