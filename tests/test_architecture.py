@@ -57,6 +57,7 @@ LAYERS = [
     "scan_file",
     "pose_result",
     "pose_file",
+    "positioning",
     # host: fine registration
     "surface",
     "residuals",
