@@ -57,9 +57,12 @@ LAYERS = [
     "scan_file",
     "pose_result",
     "pose_file",
+    "machine",
     "positioning",
     # host: fine registration
     "surface",
+    "nearest_face",
+    "tool_path",
     "residuals",
     "noise",
     "covariance",
@@ -99,6 +102,7 @@ LAYERS = [
     "checkpoint",
     # one scan, one part, one pose
     "model_file",
+    "shipped",
     "model_export",
     "inspection",
     "matched_poses",
@@ -126,6 +130,7 @@ LAYERS = [
     "commands.workpiece",
     "commands.pose_summary",
     "commands.register",
+    "commands.compensate",
     "commands.scan",
     "commands.inspect",
     "commands.export",

@@ -1,4 +1,4 @@
-"""The command line: ``vanejax register | scan | inspect | export``.
+"""The command line: ``vanejax register | compensate | scan | inspect | export``.
 
 Exit codes: 0 done, and for ``register`` accepted; 3 ambiguous; 4 rejected; 2 where an argument or
 a file cannot be used; 1 where the machine failed (a full disk); 130 on Ctrl-C. Errors are one line.
@@ -12,13 +12,14 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from vanejax.commands import export, inspect, register, scan
+from vanejax.commands import compensate, export, inspect, register, scan
 from vanejax.errors import InputError
 
 _EPILOG = """\
 examples:
   vanejax register scan.ply part.stl
   vanejax register scan.ply part.stl --weights part.npz --json pose.json --report report.html
+  vanejax compensate pose.json --camera-pose camera.json --nominal nominal.json --format kuka
   vanejax scan part.stl --out scans --views 12 --noise-mm 0.1
   vanejax inspect scan.ply
 
@@ -27,6 +28,7 @@ VANEJAX_CACHE_DIR is where compiled programs are kept (~/.cache/vanejax); off ke
 """
 _COMMANDS = {
     "register": (register, "find a part in a scan, and say whether to trust the pose"),
+    "compensate": (compensate, "say where a registered part sits in a machine"),
     "scan": (scan, "scan a CAD file virtually from the hemisphere"),
     "inspect": (inspect, "say what a scan or CAD file is"),
     "export": (export, "put a trained network into one file"),

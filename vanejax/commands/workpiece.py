@@ -19,6 +19,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CAD",
         help="the part: STL, OBJ, PLY, GLB or STEP; or the word vane for the built-in guide vane",
     )
+    add_units(parser)
+
+
+def add_units(parser: argparse.ArgumentParser) -> None:
+    """Adds ``--units-cad`` alone, for a command to which the part is an option."""
     parser.add_argument(
         "--units-cad",
         metavar="UNIT",
