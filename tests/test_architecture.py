@@ -59,6 +59,7 @@ LAYERS = [
     "pose_file",
     "machine",
     "positioning",
+    "calibration",
     # host: fine registration
     "surface",
     "nearest_face",
