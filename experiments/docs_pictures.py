@@ -1,0 +1,117 @@
+"""The pictures of docs/how_it_works.md: the scanner, a scene, a casting, a fine registration."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments import study
+from vanejax import plotting
+from vanejax.camera import Camera, Viewpoints, hemisphere_viewpoints
+from vanejax.casting import Casting, as_cast
+from vanejax.locate import register
+from vanejax.measured_scan import MeasuredScan, clean_scan
+from vanejax.measurement import measure
+from vanejax.plotting.canvas import FAINT, INK, REFERENCE_RED, SOURCE_GREEN, new_figure, style_chart
+from vanejax.plotting.casting import casting_map
+from vanejax.plotting.segments import segments_picture
+from vanejax.pose_result import PoseResult
+from vanejax.scanner import Scanner
+from vanejax.scene import Clutter, clutter_scene
+from vanejax.segmentation import segment
+from vanejax.sensor import preset
+from vanejax.vane import guide_vane
+
+VIEW = 20  # of the 216: elevation 60, azimuth 200 deg
+SHOWN = (0, 20, 85)  # views whose shadow is drawn
+
+
+def viewpoints_picture(sphere: Viewpoints, printed: Viewpoints, center: np.ndarray) -> Figure:
+    """Where the cameras stand, seen from above, and how far away the printed formula puts them."""
+    figure = new_figure(9.6, 4.4)
+    above, away = figure.subplots(1, 2)
+    place = sphere.position - center
+    kinds = (
+        ("training (162)", ~sphere.is_test, SOURCE_GREEN),
+        ("test (54)", sphere.is_test, REFERENCE_RED),
+    )
+    for name, which, color in kinds:
+        above.scatter(*place[which, :2].T, s=12, color=color, label=name, linewidths=0)
+    above.set_aspect("equal")
+    style_chart(above, title="cameras from above", xlabel="part's x (mm)", ylabel="part's y (mm)")
+    above.scatter(0, 0, marker="+", color=INK, s=60, label="the part's centre")
+    figure.legend(loc="outside lower center", ncols=5, frameon=False, labelcolor=INK, fontsize=9)
+    for elevation in (60.0, 85.0):
+        for name, views, color in (("as meant", sphere, INK), ("as printed", printed, FAINT)):
+            row = views.elevation_deg == elevation
+            distance = np.linalg.norm(views.position[row] - center, axis=1)
+            style = "-" if elevation == 60.0 else "--"
+            label = f"{name}, elevation {elevation:g}°"
+            away.plot(views.azimuth_deg[row], distance, style, color=color, label=label)
+    title = "distance from the part's centre by Algorithm 1"
+    style_chart(away, title=title, xlabel="azimuth (deg)", ylabel="mm")
+    away.set_ylim(380, 640)
+    away.set_xticks(range(0, 361, 90))
+    away.legend(frameon=False, labelcolor=INK, fontsize=9, loc="upper left", ncols=2)
+    return figure
+
+
+def shadow_picture(scanner: Scanner, views: Viewpoints) -> Figure:
+    """What three views see and what the part hides from them: the paper's Fig. 5."""
+    scans = [scanner.scan(Camera(), views.view(view), hidden=True) for view in SHOWN]
+    names = [
+        plotting.view_name(views.elevation_deg[view], views.azimuth_deg[view]) for view in SHOWN
+    ]
+    return plotting.view_and_shadow(scans, names)
+
+
+def registered(scanner: Scanner, views: Viewpoints, seed: int) -> tuple[PoseResult, MeasuredScan]:
+    """One scan by the paper's camera, registered from no guess."""
+    rng = np.random.default_rng(seed)
+    measured = measure(scanner, preset("paper_camera"), views.view(VIEW), rng)
+    scan = clean_scan(measured.points)
+    return register(scan, scanner.part, seed=seed), scan
+
+
+def scene_picture(views: Viewpoints, seed: int) -> Figure:
+    """A table, clamps and chips around the part, and what the segmentation takes for the part."""
+    part = guide_vane()
+    rng = np.random.default_rng(seed)
+    scene = clutter_scene(part, Clutter(table=True, clamps=2, chips=12), rng)
+    camera = Camera()
+    scan = scene.scanner().scan(camera, views.view(VIEW))
+    segments = segment(scan.points.astype(np.float64), part, sensor_origin=np.zeros(3), seed=seed)
+    return segments_picture(scan, camera, scene, segments)
+
+
+def main(settings: argparse.Namespace) -> None:
+    """Draws them all."""
+    part = guide_vane()
+    scanner = Scanner(part, surface_samples=100_000)
+    sphere = hemisphere_viewpoints(part.center)
+    printed = hemisphere_viewpoints(part.center, formula="printed")
+    result, scan = registered(scanner, sphere, settings.seed)
+    cast = as_cast(part, Casting(allowance_mm=0.5), np.random.default_rng(settings.seed))
+    figures = {
+        "how_viewpoints": viewpoints_picture(sphere, printed, part.center),
+        "how_shadow": shadow_picture(scanner, sphere),
+        "how_scene": scene_picture(sphere, settings.seed),
+        "how_casting": casting_map(part, cast),
+        "how_deviation": plotting.deviation_map(result, scan, part),
+        "how_residuals": plotting.residual_histogram(result),
+    }
+    settings.out.mkdir(parents=True, exist_ok=True)
+    for name, figure in figures.items():
+        plotting.save_figure(figure, settings.out / f"{name}.png", dpi=110)
+        print(settings.out / f"{name}.png")
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's arguments."""
+    return study.make_parser("docs_pictures", __doc__)
+
+
+if __name__ == "__main__":
+    study.run(main, make_parser())
