@@ -1,0 +1,173 @@
+"""Every table and figure of the paper again, with ours beside it, in one HTML page.
+
+python -m experiments.reproduce --quick [--weights FILE] [--out runs/reproduce]
+python -m experiments.reproduce [--real-scans FOLDER] [--shapes PATH] [--only NAME,...] [--plan]
+python -m experiments.reproduce --docs
+
+``--quick`` shows the recorded results of experiments/results and evaluates the shipped weights
+afresh on the 54 test views: minutes. Without it everything is trained and measured again, each
+study in a folder of its own under ``--out``: many hours, ``--plan`` says how many. Give the same
+command again to go on: what ended is not done again. A study that fails is named in the page, the
+others go on, and the exit code is 1. ``--docs`` writes docs/results.md from the recorded results.
+Results: reproduction.html in ``--out``, which needs no network and no other file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from experiments import study
+from experiments.reproduction_live import Live, evaluate_live
+from experiments.reproduction_page import Document, document, to_markdown, to_page
+from experiments.reproduction_studies import (
+    ROOT,
+    Outcome,
+    chosen,
+    estimate,
+    measured,
+    outcomes_json,
+    recorded,
+    run_studies,
+)
+from vanejax.errors import InputError
+from vanejax.shipped import WORD, find_weights
+from vanejax.vane import guide_vane
+from vanejax.whole_file import check_writable, write_text
+
+DOCS = ROOT / "docs"
+PAGE = DOCS / "results.md"
+FILE = "reproduction.html"
+SOLIDS = "solids"  # what public.py itself trains on where there is no ModelNet40
+RECORDED = "Results are the recorded ones of experiments/results."
+
+
+@dataclasses.dataclass(frozen=True)
+class Reproduction:
+    """What a run of the command left.
+
+    Attributes:
+      page: the HTML file.
+      outcomes: of the studies; none where recorded results are shown.
+      live: what was evaluated for the page.
+    """
+
+    page: Path
+    outcomes: tuple[Outcome, ...] = ()
+    live: Live | None = None
+
+    @property
+    def failed(self) -> list[str]:
+        """Names of the studies that failed, or could not be run for that."""
+        return [
+            o.study.name
+            for o in self.outcomes
+            if o.state == "failed" or (o.state == "not run" and o.study.needs)
+        ]
+
+
+def docs_page() -> str:
+    """docs/results.md as the recorded results make it."""
+    mode = (
+        "Made by `python -m experiments.reproduce --docs` from the recorded results in "
+        "`experiments/results`; `--quick` makes a page of it, with more pictures and the shipped "
+        "weights evaluated afresh."
+    )
+    return to_markdown(document(recorded(), mode))
+
+
+def quick(out: Path, weights: str) -> Reproduction:
+    """The page of the recorded results, with the weights evaluated afresh.
+
+    Raises:
+      InputError: weights that cannot be used, or a folder that cannot be written.
+    """
+    page = _page(out)
+    matcher = find_weights(weights, guide_vane())
+    words = "those that come with the package" if weights == WORD else Path(weights).name
+    live = evaluate_live(matcher, words, out)
+    mode = f"{RECORDED} The weights were evaluated afresh, and their pictures drawn, for this page."
+    report = document(recorded(), mode, live=live, docs=DOCS, run=out)
+    _write(page, report)
+    return Reproduction(page, live=live)
+
+
+def full(out: Path, inputs: dict[str, str], only: str | None, plan: bool) -> Reproduction | None:
+    """Trains and measures everything again; None where only the plan was asked for.
+
+    Raises:
+      InputError: a study that is none, or a folder that cannot be written.
+    """
+    studies = chosen(only)
+    print(estimate(studies, out, inputs), flush=True)
+    if plan:
+        return None
+    page = _page(out)
+    outcomes = run_studies(studies, out, inputs, say=lambda text: print(text, flush=True))
+    write_text(out / "outcomes.json", outcomes_json(outcomes))
+    mode = "Everything that stands here was trained and measured for this page."
+    _write(page, document(measured(studies, out), mode, outcomes=outcomes, run=out))
+    return Reproduction(page, tuple(outcomes))
+
+
+def _page(out: Path) -> Path:
+    """The page's path, once it is sure that it can be written."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be used as a folder ({error.strerror})") from error
+    check_writable(out / FILE)
+    return out / FILE
+
+
+def _write(page: Path, report: Document) -> None:
+    text = to_page(report)
+    write_text(page, text)
+    print(f"{page}: {len(text) / 1e6:.1f} MB")
+
+
+def main(settings: argparse.Namespace) -> int:
+    """The command; its exit code."""
+    if settings.docs:
+        write_text(PAGE, docs_page())
+        print(PAGE)
+        return 0
+    if settings.quick:
+        for name in ("real_scans", "shapes", "only"):
+            if getattr(settings, name):
+                raise InputError(f"--{name.replace('_', '-')} has no meaning with --quick")
+        quick(settings.out, settings.weights)
+        return 0
+    if settings.weights != WORD:
+        raise InputError("--weights is for --quick; without it every network is trained")
+    inputs: dict[str, Any] = {"shapes": settings.shapes or SOLIDS}
+    if settings.real_scans:
+        inputs["real_scans"] = settings.real_scans
+    done = full(settings.out, inputs, settings.only, settings.plan)
+    if done is None or not done.failed:
+        return 0
+    print(f"not everything could be measured: {', '.join(done.failed)}")
+    return 1
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's arguments."""
+    parser = study.make_parser("reproduce", __doc__)
+    parser.add_argument("--quick", action="store_true", help="recorded results, minutes")
+    parser.add_argument(
+        "--weights", default=WORD, help="evaluated by --quick; those of the package (shipped)"
+    )
+    parser.add_argument("--real-scans", metavar="FOLDER", help="as experiments.real_scans")
+    parser.add_argument(
+        "--shapes", metavar="PATH", help="public shapes to train on: ModelNet40, a file (solids)"
+    )
+    parser.add_argument("--only", metavar="NAMES", help="these studies and what they need")
+    parser.add_argument("--plan", action="store_true", help="print the studies and end")
+    parser.add_argument("--docs", action="store_true", help="write docs/results.md and end")
+    return parser
+
+
+if __name__ == "__main__":
+    study.run(main, make_parser())

@@ -1,0 +1,98 @@
+"""What the report measures afresh: the shipped network on the test views."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+from experiments.configs import vane
+from experiments.evaluate import evaluate
+from experiments.experiment import Experiment
+from experiments.train import load_or_scan
+from vanejax.errors import InputError
+from vanejax.model_file import TrainedMatcher
+
+FOLDER = "vane"  # as that of the study whose pictures these are
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Live:
+    """An evaluation of a network made for the report.
+
+    Attributes:
+      report: what evaluation.json holds.
+      weights: the network's file or origin, in words.
+      trained: the commit that it was trained from, as far as known.
+      seconds: scans, registrations and pictures.
+    """
+
+    report: dict[str, Any]
+    weights: str
+    trained: str | None
+    seconds: float
+
+
+def evaluate_live(
+    matcher: TrainedMatcher,
+    weights: str,
+    out: Path,
+    *,
+    config: Experiment | None = None,
+    progress: bool = True,
+) -> Live:
+    """Scans the test views anew and registers them, as `experiments.evaluate` does.
+
+    Args:
+      matcher: of the guide vane.
+      weights: where it is from, for the reader.
+      out: evaluation.json and pictures go to its folder vane.
+      config: the recipe, `vane.py` if not given; its views and points.
+      progress: whether to show progress bars.
+
+    Raises:
+      InputError: weights for another part, or of a network that `config` does not describe.
+    """
+    config = vane.get_config() if config is None else config
+    part = config.make_part()
+    matcher.check_part(part)
+    began = time.perf_counter()
+    folder = out / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    scans = load_or_scan(config, part, folder / "scans.npz")
+    check_recipe(matcher, config)
+    report = evaluate(config, scans, matcher.variables, folder, part=part, progress=progress)
+    seconds = time.perf_counter() - began
+    return Live(report, weights, matcher.trained.get("commit"), seconds)
+
+
+def check_recipe(matcher: TrainedMatcher, config: Experiment) -> None:
+    """Refuses weights whose network or thinning differs from the config's.
+
+    Raises:
+      InputError: names what differs.
+    """
+    network = config.make_network()
+    mine = {
+        "model": network.model,
+        "iterations": network.iterations,
+        "voxel_mm": config.data.voxel_mm,
+        "num_reference": config.data.num_reference,
+    }
+    theirs = {
+        "model": matcher.model,
+        "iterations": matcher.iterations,
+        "voxel_mm": matcher.voxel_mm,
+        "num_reference": matcher.drawing.num_reference,
+    }
+    found = [
+        f"{name} is {theirs[name]}, not {value}"
+        for name, value in mine.items()
+        if theirs[name] != value
+    ]
+    if found:
+        raise InputError(
+            f"the weights are of another recipe than {config.name}: {'; '.join(found)}; "
+            "give weights exported from a run of it"
+        )

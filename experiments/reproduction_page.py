@@ -1,0 +1,328 @@
+"""The report as one HTML file for screen and paper, and as Markdown for docs/results.md."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import datetime
+import html
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.image import imread
+
+from experiments.machine import cores, cpu_model
+from experiments.reproduction_claims import CLAIMS, GOALS, Results
+from experiments.reproduction_live import Live
+from experiments.reproduction_markdown import slug, to_html
+from experiments.reproduction_sections import (
+    Picture,
+    Section,
+    counts,
+    outcomes_table,
+    picture_file,
+    provenance,
+    sections,
+    summary,
+)
+from experiments.reproduction_studies import Outcome
+from experiments.run_folder import git_commit
+
+TITLE = "The paper, measured again"
+PAPER = (
+    "“Simulation of Self-Occlusion Virtual Dataset Method for Robust Point Matching Algorithm, "
+    "With Applications to Positioning of Guide Vanes”"
+)
+HOW_TO_READ = (
+    "The paper's figures are of its own vanes, camera and machine, which nobody else has; ours are "
+    "of the parametric guide vane built in here, under virtual sensors unless a section says real. "
+    "RMSE and FFMDE are not 0 at the true pose but what noise and the spacing of the points make "
+    "of them: where ours is no more than that, the row says not comparable, whichever is lower. "
+    "Every verdict and every sentence beside it is computed from the figures."
+)
+PICTURE_DPI = 110
+
+STYLE = """
+:root { --ink: #1d2025; --soft: #5b626d; --line: #dfe2e6; --well: #f6f7f8; --link: #0b5cad;
+  --good: #14783a; --half: #8a5a00; --bad: #b3261e; --none: #5b626d; }
+* { box-sizing: border-box; }
+html { -webkit-text-size-adjust: 100%; }
+body { margin: 0; background: #fff; color: var(--ink); font-size: 16px; line-height: 1.5;
+  font-family: system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "Noto Sans", Arial,
+  sans-serif; font-variant-numeric: tabular-nums; }
+main, header, footer { max-width: 1080px; margin: 0 auto; padding: 0 24px; }
+header { padding-top: 40px; }
+footer { padding-top: 8px; padding-bottom: 40px; color: var(--soft); font-size: 14px; }
+h1 { font-size: 34px; line-height: 1.15; margin: 0 0 8px; letter-spacing: -.015em; }
+h2 { font-size: 23px; line-height: 1.25; margin: 52px 0 12px; padding-top: 14px;
+  border-top: 2px solid var(--ink); }
+h3 { font-size: 17px; margin: 30px 0 8px; }
+p, ul { margin: 12px 0; max-width: 78ch; }
+.lead { color: var(--soft); }
+a { color: var(--link); }
+nav { background: var(--well); padding: 14px 20px; border-radius: 8px; margin: 24px 0; }
+nav h2 { border: 0; margin: 0 0 6px; padding: 0; font-size: 15px; }
+nav ol { margin: 0; padding-left: 22px; columns: 2; column-gap: 36px; font-size: 15px; }
+nav li { break-inside: avoid; }
+.scroll { overflow-x: auto; margin: 16px 0; }
+.scroll:focus-visible, a:focus-visible { outline: 2px solid #2b6cb0; outline-offset: 2px; }
+table { border-collapse: collapse; font-size: 14px; line-height: 1.4; width: 100%; }
+th, td { text-align: left; vertical-align: top; padding: 7px 14px 7px 0;
+  border-bottom: 1px solid var(--line); }
+th { font-weight: 600; color: var(--soft); border-bottom: 1px solid var(--soft);
+  vertical-align: bottom; }
+td.n { text-align: right; }
+table.wide { font-size: 12.5px; }
+table.wide th, table.wide td { padding: 5px 10px 5px 0; }
+pre { margin: 0; padding: 14px 16px; background: var(--well); border-radius: 8px; font-size: 12px;
+  line-height: 1.45; display: inline-block; min-width: 100%;
+  font-family: ui-monospace, "SF Mono", "Cascadia Mono", "DejaVu Sans Mono", Menlo, Consolas,
+  monospace; }
+code { font-family: ui-monospace, "SF Mono", "Cascadia Mono", "DejaVu Sans Mono", Menlo, Consolas,
+  monospace; font-size: .88em; overflow-wrap: anywhere; }
+figure { margin: 22px 0; }
+figure img { display: block; width: 100%; height: auto; max-width: var(--width); margin: 0 auto; }
+figcaption { color: var(--soft); font-size: 14px; margin: 8px auto 0; max-width: 90ch; }
+.verdict { font-weight: 650; white-space: nowrap; }
+.verdict::before { content: ""; display: inline-block; width: 9px; height: 9px; margin-right: 6px;
+  border-radius: 50%; background: currentColor; }
+.good { color: var(--good); } .half { color: var(--half); } .bad { color: var(--bad); }
+.none { color: var(--none); } .none::before { background: none; border: 1.5px solid; }
+@media (max-width: 700px) {
+  main, header, footer { padding-left: 16px; padding-right: 16px; }
+  header { padding-top: 24px; }
+  h1 { font-size: 27px; } h2 { font-size: 20px; margin-top: 40px; }
+  nav ol { columns: 1; }
+  .stack thead { position: absolute; width: 1px; height: 1px; overflow: hidden;
+    clip-path: inset(50%); }
+  .stack, .stack tbody, .stack tr, .stack td { display: block; }
+  .stack tr { padding: 10px 0; border-bottom: 1px solid var(--line); }
+  .stack td { border: 0; padding: 2px 0 2px 92px; text-align: left; position: relative; }
+  .stack td::before { content: attr(data-head); position: absolute; left: 0; width: 84px;
+    color: var(--soft); font-size: 13px; }
+  .stack td:first-child { padding-left: 0; font-weight: 600; }
+  .stack td:first-child::before { content: none; }
+}
+@page { size: A4; margin: 15mm 14mm 16mm; }
+@media print {
+  body { font-size: 9.5pt; line-height: 1.4; }
+  main, header, footer { max-width: none; padding: 0; }
+  h1 { font-size: 21pt; } h2 { font-size: 14pt; margin-top: 18pt; } h3 { font-size: 11pt; }
+  h2, h3 { break-after: avoid; }
+  p { orphans: 3; widows: 3; }
+  a { color: inherit; text-decoration: none; }
+  nav { background: none; padding: 0; break-inside: avoid; }
+  .scroll { overflow: visible; }
+  table { font-size: 7.8pt; }
+  table.wide { font-size: 6.3pt; }
+  table.wide th, table.wide td { padding: 2pt 4pt 2pt 0; }
+  thead { display: table-header-group; }
+  tr { break-inside: avoid; }
+  pre { display: block; min-width: 0; background: none; border: .5pt solid var(--line);
+    padding: 2mm; font-size: min(8pt, calc(176mm / var(--columns) / .605)); }
+  figure { break-inside: avoid; margin: 10pt 0; }
+  figure img { max-height: 200mm; width: auto; max-width: 100%; }
+  figcaption { font-size: 8.5pt; }
+}
+"""
+_KINDS = {
+    "better": "good",
+    "met": "good",
+    "partly met": "half",
+    "not met": "bad",
+    "not comparable": "none",
+    "not measured": "none",
+    "failed": "bad",
+    "not run": "none",
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Document:
+    """What the report says.
+
+    Attributes:
+      results: by record's name.
+      mode: how they came about, in a sentence.
+      sections: of the page.
+      outcomes: of a run's studies; none where recorded results are shown.
+      docs, run: folders of pictures, as far as there are any.
+    """
+
+    results: Results
+    mode: str
+    sections: Sequence[Section]
+    outcomes: Sequence[Outcome] = ()
+    docs: Path | None = None
+    run: Path | None = None
+
+
+def document(
+    results: Results,
+    mode: str,
+    *,
+    live: Live | None = None,
+    outcomes: Sequence[Outcome] = (),
+    docs: Path | None = None,
+    run: Path | None = None,
+) -> Document:
+    """The report of some results; see `Document`."""
+    return Document(results, mode, sections(results, live), outcomes, docs, run)
+
+
+def to_markdown(report: Document) -> str:
+    """docs/results.md: no date and no machine but those of the records."""
+    lines = [
+        f"# {TITLE}",
+        "",
+        f"{PAPER}: every table and figure, with the paper's value, ours, and what follows. "
+        f"{report.mode}",
+        "",
+        HOW_TO_READ,
+        "",
+        *_top(report),
+    ]
+    for section in report.sections:
+        lines += [f"## {section.title}", ""]
+        for part in section.parts:
+            text = _markdown_picture(part) if isinstance(part, Picture) else part
+            lines += [text, ""] if text else []
+    lines += _end(report)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _top(report: Document) -> list[str]:
+    """The two summaries, as Markdown."""
+    results = report.results
+    return [
+        "## What the paper claims",
+        "",
+        f"{counts(CLAIMS, results)}.",
+        "",
+        summary(CLAIMS, results, paper=True),
+        "",
+        "## What the paper has not",
+        "",
+        f"{counts(GOALS, results)}.",
+        "",
+        summary(GOALS, results, paper=False),
+        "",
+    ]
+
+
+def _end(report: Document) -> list[str]:
+    """Provenance and, of a run, what became of its studies, as Markdown."""
+    lines = []
+    if report.outcomes:
+        lines += ["## What was run", "", outcomes_table(report.outcomes), ""]
+    return [
+        *lines,
+        "## Where every number comes from",
+        "",
+        "Tables and sentences are made from these records and from nothing else; "
+        "`python -m experiments.reproduce` runs all the commands, one after the other. A `+` after "
+        "a commit: the source tree had changes.",
+        "",
+        provenance(report.results),
+        "",
+    ]
+
+
+def _markdown_picture(picture: Picture) -> str:
+    return f"![{picture.alt}]({picture.docs})\n\n{picture.caption}" if picture.docs else ""
+
+
+def to_page(report: Document) -> str:
+    """The HTML file's text: no script, no request, every picture inside."""
+    body = [f"<p>{html.escape(HOW_TO_READ)}</p>", _stacked(to_html("\n".join(_top(report))))]
+    for section in report.sections:
+        body.append(f'<section aria-labelledby="{section.anchor}">')
+        body.append(f'<h2 id="{section.anchor}">{html.escape(section.title)}</h2>')
+        for number, part in enumerate(section.parts):
+            if isinstance(part, Picture):
+                body.append(_figure(part, report))
+            else:
+                text = to_html(part, name=section.title)
+                body.append(_stacked(text) if number == 0 else text)
+        body.append("</section>")
+    body.append(to_html("\n".join(_end(report))))
+    machine = f"{cpu_model()}, {cores()} cores"
+    now = datetime.datetime.now().astimezone().isoformat(sep=" ", timespec="minutes")
+    made = f"Made {now}, commit {(git_commit() or 'unknown')[:11]}, {machine}."
+    titles = ["What the paper claims", "What the paper has not"]
+    titles += [section.title for section in report.sections]
+    titles += ["What was run"] if report.outcomes else []
+    titles += ["Where every number comes from"]
+    contents = "".join(
+        f'<li><a href="#{slug(title)}">{html.escape(title)}</a></li>' for title in titles
+    )
+    return _badges(f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; style-src \
+'unsafe-inline'">
+<title>{TITLE}</title>
+<style>{STYLE}</style>
+</head>
+<body>
+<header>
+<h1>{TITLE}</h1>
+<p class="lead">{html.escape(PAPER)}: every table and figure, with the paper’s value, ours, and \
+what follows. {html.escape(report.mode)}</p>
+<p class="lead">{html.escape(made)}</p>
+</header>
+<main>
+<nav aria-labelledby="contents"><h2 id="contents">Contents</h2><ol>{contents}</ol></nav>
+{chr(10).join(body)}
+</main>
+<footer><p>{html.escape(made)}</p></footer>
+</body>
+</html>
+""")
+
+
+def _badges(text: str) -> str:
+    """Verdicts with their colour beside their words."""
+    for words, kind in _KINDS.items():
+        mark = f"<strong>{words}</strong>"
+        text = text.replace(mark, f'<strong class="verdict {kind}">{words}</strong>')
+    return text
+
+
+def _stacked(text: str) -> str:
+    """Tables whose rows a narrow screen shows as blocks: every cell knows its column's head."""
+    pieces = text.split("<table>")
+    for index, piece in enumerate(pieces[1:], 1):
+        heads = [cell.split("</th>")[0] for cell in piece.split('<th scope="col">')[1:]]
+        head, _, rest = piece.partition("<tbody>")
+        rows = rest.split("<tr>")
+        for number, row in enumerate(rows[1:], 1):
+            cells = row.split("<td")
+            rows[number] = cells[0] + "".join(
+                f'<td data-head="{name}"{cell}' for name, cell in zip(heads, cells[1:], strict=True)
+            )
+        pieces[index] = f"{head}<tbody>{'<tr>'.join(rows)}"
+    return '<table class="stack">'.join(pieces)
+
+
+def _figure(picture: Picture, report: Document) -> str:
+    """A picture with its words; nothing where it was not made."""
+    if picture.draw is not None:
+        buffer = io.BytesIO()
+        picture.draw().savefig(buffer, format="png", dpi=PICTURE_DPI, metadata={"Software": None})
+        data = buffer.getvalue()
+    else:
+        path = picture_file(picture, docs=report.docs, run=report.run)
+        if path is None:
+            return ""
+        data = path.read_bytes()
+    height, width = imread(io.BytesIO(data)).shape[:2]
+    address = "data:image/png;base64," + base64.b64encode(data).decode("ascii")
+    return (
+        f'<figure><img src="{address}" width="{width}" height="{height}" '
+        f'style="--width: {width}px" alt="{html.escape(picture.alt)}">'
+        f"<figcaption>{html.escape(picture.caption)}</figcaption></figure>"
+    )
