@@ -59,6 +59,7 @@ LAYERS = [
     "pose_file",
     "machine",
     "positioning",
+    "cube",
     "calibration",
     # host: fine registration
     "surface",

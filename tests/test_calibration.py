@@ -6,16 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vanejax.calibration import (
-    Cube,
-    averaged,
-    calibrate,
-    cube_faces,
-    cube_of,
-    find_cube,
-    fit_face,
-    matched,
-)
+from vanejax.calibration import averaged, calibrate, matched
+from vanejax.cube import Cube, cube_faces, cube_of, find_cube, fit_face
 from vanejax.errors import InputError
 from vanejax.rigid_transform import RigidTransform
 
@@ -44,21 +36,30 @@ def placement(rng: np.random.Generator) -> RigidTransform:
 
 
 def placements(
-    seed: int, count: int = 8, *, camera_mm: float = 0.0, probe_mm: float = 0.0, touched: int = 9
+    seed: int,
+    count: int = 8,
+    *,
+    camera_mm: float = 0.0,
+    probe_mm: float = 0.0,
+    touched: int = 9,
+    reach_mm: float = 58.0,
 ) -> tuple[list[Cube], list[Cube]]:
-    """Cubes of camera and machine, the camera's faces named as it happens."""
+    """Cubes of camera and machine, the camera's faces named as it happens.
+
+    The probe touches each face within ``reach_mm`` of the corner.
+    """
     rng = np.random.default_rng(seed)
     cubes: tuple[list[Cube], list[Cube]] = ([], [])
     for _ in range(count):
         camera_from_cube = placement(rng)
         machine_from_cube = MACHINE_FROM_CAMERA @ camera_from_cube
-        for mine, frame, noise, number in (
-            (cubes[0], camera_from_cube, camera_mm, 300),
-            (cubes[1], machine_from_cube, probe_mm, touched),
+        for mine, frame, noise, number, reach in (
+            (cubes[0], camera_from_cube, camera_mm, 300, 58.0),
+            (cubes[1], machine_from_cube, probe_mm, touched, reach_mm),
         ):
             points = []
             for k in range(3):
-                exact = face_points(k, rng.uniform(-58, -2, (number, 2)))
+                exact = face_points(k, rng.uniform(-reach, -2, (number, 2)))
                 exact[:, k] += noise * rng.standard_normal(number)
                 points.append(frame.apply(exact))
             shift = rng.integers(3) if mine is cubes[0] else 0
@@ -234,6 +235,19 @@ def test_the_joint_fit_is_honest_and_better_than_the_mean():
     rms = [np.sqrt(np.mean(np.square(errors), axis=0)) for errors in (joint, mean)]
     assert np.linalg.norm(rms[0][:3]) < 0.95 * np.linalg.norm(rms[1][:3])
     assert np.linalg.norm(rms[0][3:]) < 0.95 * np.linalg.norm(rms[1][3:])
+
+
+def test_planes_that_were_touched_at_one_end_are_weighed_by_their_lever():
+    """A noisy scan's planes tilt: where they are touched decides what that does to the offset."""
+    chi, misfit = [], []
+    for seed in range(40):
+        cubes = placements(300 + seed, camera_mm=0.5, probe_mm=0.002, touched=6, reach_mm=25.0)
+        found = calibrate(*cubes)
+        e = error(found.machine_from_camera, found.center)
+        chi.append(e @ np.linalg.solve(found.covariance / max(1, found.misfit**2), e))
+        misfit.append(found.misfit)
+    assert 4.3 < np.mean(chi) < 7.7  # 6 +- 0.55
+    assert np.mean(np.square(misfit)) == pytest.approx(1, abs=0.1)  # 2,640 freedoms: 3 %
 
 
 def test_the_mean_tells_its_spread():
