@@ -16,7 +16,7 @@ from example_result import example_result, pose
 
 from vanejax.cli import main
 from vanejax.errors import InputError
-from vanejax.machine import NOTATIONS, read_kuka, read_matrix, write_kuka
+from vanejax.frame_notation import NOTATIONS, read_kuka, read_matrix, write_kuka
 from vanejax.part import Part, part_from_mesh
 from vanejax.pose_file import read_record, write_result
 from vanejax.rigid_transform import RigidTransform

@@ -12,22 +12,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vanejax import machine
+from vanejax import frame_notation
 from vanejax.commands.compensate import FORMATS
 from vanejax.errors import InputError
-from vanejax.machine import (
+from vanejax.frame_notation import (
     NOTATIONS,
-    Compensation,
-    axis_angle_deg,
     notation_of,
-    read_frame,
     read_heidenhain,
     read_iso,
     read_kuka,
     read_siemens,
-    rounding_error_mm,
     write_iso,
 )
+from vanejax.machine import Compensation, axis_angle_deg, read_frame, rounding_error_mm
 from vanejax.rigid_transform import RigidTransform
 
 RADIUS = 120.0
@@ -74,7 +71,7 @@ def test_without_rounding_nothing_is_lost(name: str, rotation: Rotation) -> None
     """Near the poles too, where each angle alone is hardly known."""
     with pytest.MonkeyPatch.context() as patch:
         for places in ("DECIMALS_MM", "DECIMALS_DEG", "DECIMALS_MATRIX"):
-            patch.setattr(machine, places, 15)
+            patch.setattr(frame_notation, places, 15)
         found = NOTATIONS[name].read(NOTATIONS[name].write(frame(rotation)))
     # f64 eps times a few products; 1e-12 mm of 1300
     np.testing.assert_allclose(found.rotation, rotation.as_matrix(), rtol=0, atol=2e-14)

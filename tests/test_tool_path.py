@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 import vanejax
 from vanejax.camera import Camera, hemisphere_viewpoints
 from vanejax.errors import InputError
-from vanejax.machine import Compensation, read_kuka, write_kuka
+from vanejax.frame_notation import read_kuka, write_kuka
+from vanejax.machine import Compensation
 from vanejax.measured_scan import clean_scan
 from vanejax.part import Part, part_from_mesh
 from vanejax.rigid_transform import RigidTransform

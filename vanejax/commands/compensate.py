@@ -172,7 +172,7 @@ def _refusal(record: PoseRecord, arguments: argparse.Namespace) -> int:
 
 
 def _work_frame(machine_from_part: RigidTransform, chosen: str, part: Part | None) -> list[str]:
-    from vanejax.machine import NOTATIONS
+    from vanejax.frame_notation import NOTATIONS
 
     lines = ["work frame: machine_from_part, where the part sits in the machine"]
     for name in FORMATS if chosen == "all" else (chosen,):
@@ -189,7 +189,8 @@ def _rounding(name: str, machine_from_part: RigidTransform, part: Part) -> float
     """What reading the text again is off by on the part, mm."""
     import numpy as np
 
-    from vanejax.machine import NOTATIONS, rounding_error_mm
+    from vanejax.frame_notation import NOTATIONS
+    from vanejax.machine import rounding_error_mm
 
     notation = NOTATIONS[name]
     farthest = float(np.linalg.norm(part.mesh.vertices, axis=1).max())
@@ -200,7 +201,7 @@ def _rounding(name: str, machine_from_part: RigidTransform, part: Part) -> float
 def _compensation(compensation: Compensation, chosen: str, part: Part | None) -> list[str]:
     import numpy as np
 
-    from vanejax.machine import NOTATIONS
+    from vanejax.frame_notation import NOTATIONS
 
     place = "origin" if part is None else "centre"
     point = np.zeros((1, 3)) if part is None else part.center[None]
