@@ -1,0 +1,292 @@
+"""The report's interactive view alone, for a notebook: orbit, zoom, and nothing from the network.
+
+A `View3d` at the end of a cell shows itself in Jupyter, VS Code and exported HTML. It is the same
+`viewer.js` as in the report, in a frame of its own that may run scripts and do nothing else.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import html
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import jinja2
+import numpy as np
+from matplotlib.colors import to_rgb
+from scipy.spatial.transform import Rotation, Slerp
+
+from vanejax.errors import InputError
+from vanejax.measured_scan import MeasuredScan
+from vanejax.part import Part
+from vanejax.plotting.canvas import REFERENCE_RED, SOURCE_GREEN
+from vanejax.plotting.clouds import seen_and_hidden
+from vanejax.plotting.deviation import NO_PARTNER, color_limit_mm
+from vanejax.pose_result import PoseResult
+from vanejax.report.pictures import color_bar
+from vanejax.report.viewer import MAX_POINTS, _base64, _columns, _grid, _spacing_mm, simplified
+from vanejax.report.viewer import viewer as viewer_of_result
+from vanejax.rigid_transform import RigidTransform
+from vanejax.scanner import Scan
+from vanejax.whole_file import write_text
+
+_HEIGHT_PX = 560
+# a reader who stands a little beside the camera sees some of its shadow
+_YAW_DEG, _PITCH_DEG = 28.0, 14.0
+_FRAMES_PER_STEP = 12
+# the viewer colours dots by deviation: here its two ends are the two colours
+_CODE_UM = 32_000
+_GREEN_AND_RED = np.repeat([(*to_rgb(c), 1.0) for c in (SOURCE_GREEN, REFERENCE_RED)], 128, axis=0)
+_NOISE_LIFT = 0.01  # radii: noise of a network's scans, which would hide half of the dots
+_DOT, _LARGEST_DOT = 0.45, 0.012  # spacings, radii: between the dots the part's shading shows
+
+
+@dataclasses.dataclass(frozen=True)
+class View3d:
+    """An interactive view.
+
+    Attributes:
+      page: a whole HTML page, self-contained.
+      height_px: of its frame in a notebook.
+    """
+
+    page: str = dataclasses.field(repr=False)
+    height_px: int = _HEIGHT_PX
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the page in a frame that can reach nothing outside itself."""
+        # ASCII: a document read in another encoding would change the scripts, and their hashes
+        page = html.escape(self.page).encode("ascii", "xmlcharrefreplace").decode()
+        return (
+            f'<iframe srcdoc="{page}" sandbox="allow-scripts" title="3-D view" '
+            f'style="width: 100%; height: {self.height_px}px; border: 0"></iframe>'
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the page; any browser with WebGL 2 opens it, without a network.
+
+        Raises:
+          InputError: a name that does not end in .html or .htm, or a file that cannot be written.
+        """
+        if Path(path).suffix.lower() not in (".html", ".htm"):
+            raise InputError(f"{path}: the view is an HTML page; let its name end in .html")
+        write_text(path, self.page)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Legend:
+    """One colour of the dots: what `page.css` calls it, and what it means."""
+
+    dot: str
+    meaning: str
+
+
+@dataclasses.dataclass(frozen=True)
+class _Controls:
+    """How the poses are chosen and the dots explained.
+
+    Attributes:
+      poses: names of the poses; a single one is no choice.
+      legend: of the dots.
+      stops: indices of the poses at which a film halts; none where the poses are buttons.
+      limit_mm: end of the colour bar; 0 where dots are not coloured by deviation.
+      first: the pose shown at the start.
+    """
+
+    poses: Sequence[str]
+    legend: Sequence[_Legend]
+    stops: Sequence[int] = ()
+    limit_mm: float = 0.0
+    first: int = 0
+
+
+def scan_view(scan: Scan, part: Part, *, voxel_mm: float = 1.5) -> View3d:
+    """What a view sees (green) and what self-occlusion hides from it (red), on the part.
+
+    Args:
+      scan: with `Scan.hidden`.
+      part: what was scanned.
+      voxel_mm: one point per voxel is shown, of either cloud.
+
+    Raises:
+      InputError: the scan was made without hidden points, or a voxel is not positive.
+    """
+    if not voxel_mm > 0:
+        raise InputError(f"voxel_mm={voxel_mm!r} should be positive, in mm")
+    seen, hidden = seen_and_hidden(scan, voxel_mm=voxel_mm)
+    codes = np.concatenate([np.full(len(seen), -_CODE_UM), np.full(len(hidden), _CODE_UM)])
+    here = RigidTransform.identity(dtype=np.float64)
+    scene = _scene(
+        part, np.concatenate([seen, hidden]), [here, here], codes_um=codes,
+        colors=_GREEN_AND_RED,
+        reader_from_part=_beside(scan.camera_from_part.rotation), lift_mm=0.002 * part.radius,
+    )  # fmt: skip
+    legend = [_Legend("scan", "seen"), _Legend("cad", "hidden by self-occlusion")]
+    return _view(scene, _Controls(["scan"], [*legend, _Legend("metal", "CAD")]))
+
+
+def pose_view(result: PoseResult, scan: MeasuredScan, part: Part) -> View3d:
+    """The scan on the part at every pose of a result, and where it deviates: as in the report."""
+    shown = viewer_of_result(result, scan, part)
+    lost = np.isnan(result.verification.deviation_mm).any()
+    legend = [_Legend("lost", "no partner on the part")] if lost else []
+    limit_mm = color_limit_mm(result.verification)
+    controls = _Controls(shown.poses, legend, limit_mm=limit_mm, first=1)
+    return _view(shown.json, controls)
+
+
+def motion_view(
+    points: np.ndarray,
+    poses: Sequence[RigidTransform],
+    names: Sequence[str],
+    part: Part,
+    *,
+    camera_from_part: RigidTransform,
+) -> View3d:
+    """A film of a cloud that moves onto the part, with a slider; it can be turned while it runs.
+
+    Between two poses the cloud turns about one axis, and its centre goes straight.
+
+    Args:
+      points: [N, 3] mm, source frame.
+      poses: part_from_source, mm, at least two: before, and after every iteration.
+      names: of the poses, one each.
+      part: what it moves onto.
+      camera_from_part: the reader looks from beside this camera; see `Viewpoints.view`.
+
+    Raises:
+      InputError: no points, fewer than two poses, another number of names, or a pose that is not
+        finite.
+    """
+    points = np.asarray(points, np.float64)
+    poses = [RigidTransform(*(np.asarray(value, np.float64) for value in pose)) for pose in poses]
+    if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
+        raise InputError(f"points have shape {points.shape}; they should be [N, 3], N at least 1")
+    if len(poses) < 2 or len(poses) != len(names):
+        raise InputError(
+            f"{len(poses)} poses with {len(names)} names; a film needs two or more, a name for each"
+        )
+    if not (np.isfinite(points).all() and all(np.isfinite(p.as_matrix()).all() for p in poses)):
+        raise InputError("a point or a pose is not finite: this registration failed")
+    film = _between(poses, points.mean(axis=0))
+    stops = range(0, len(film), _FRAMES_PER_STEP)
+    captions = [names[index // _FRAMES_PER_STEP] for index in range(len(film))]
+    scene = _scene(
+        part, points, film, codes_um=np.full(len(points), -_CODE_UM), colors=_GREEN_AND_RED,
+        reader_from_part=_beside(camera_from_part.rotation), lift_mm=_NOISE_LIFT * part.radius,
+    )  # fmt: skip
+    legend = [_Legend("scan", "scan"), _Legend("metal", "CAD")]
+    return _view(scene, _Controls(captions, legend, stops=list(stops)))
+
+
+def _between(poses: Sequence[RigidTransform], center: np.ndarray) -> list[RigidTransform]:
+    """A film from pose to pose: `_FRAMES_PER_STEP` frames from each to the next, and the last.
+
+    ``center`` [3] of the cloud, source frame, goes straight; a turn about a far origin would swing.
+    """
+    turns = Rotation.from_matrix(np.stack([pose.rotation for pose in poses]))
+    places = np.stack([pose.rotation @ center + pose.translation for pose in poses])
+    whole = np.arange(len(poses), dtype=np.float64)
+    times = np.arange((len(poses) - 1) * _FRAMES_PER_STEP + 1) / _FRAMES_PER_STEP
+    rotations = Slerp(whole, turns)(times).as_matrix()
+    path = np.stack([np.interp(times, whole, places[:, axis]) for axis in range(3)], axis=1)
+    return [RigidTransform(r, p - r @ center) for r, p in zip(rotations, path, strict=True)]
+
+
+def _beside(camera_from_part: np.ndarray) -> np.ndarray:
+    """reader_from_part [3, 3] of a reader who stands to the left of a camera, and above it."""
+    turn = Rotation.from_euler("yx", [_YAW_DEG, _PITCH_DEG], degrees=True).as_matrix()
+    return turn @ np.asarray(camera_from_part, np.float64)
+
+
+def _scene(
+    part: Part,
+    points: np.ndarray,
+    poses: Sequence[RigidTransform],
+    *,
+    codes_um: np.ndarray,
+    colors: np.ndarray,
+    reader_from_part: np.ndarray,
+    lift_mm: float,
+) -> str:
+    """What `viewer.js` reads, as `viewer.viewer` writes it, for a cloud that has no result.
+
+    Args:
+      part: shown as a surface.
+      points: [N, 3] mm.
+      poses: part_from_points, at least two.
+      codes_um: [N], from -32,000 to 32,000: where in ``colors`` a dot finds its own.
+      colors: [256, 4], 0 to 1.
+      reader_from_part: [3, 3], rows right, up, towards the reader.
+      lift_mm: how far in front of the surface dots are drawn, at least.
+    """
+    if len(points) > MAX_POINTS:
+        some = np.random.default_rng(0).choice(len(points), MAX_POINTS, replace=False)
+        points, codes_um = points[some], codes_um[some]
+    vertices, faces, _ = simplified(
+        np.asarray(part.mesh.vertices, np.float64), np.asarray(part.mesh.faces)
+    )
+    local_from_part = RigidTransform(np.eye(3), -part.center)
+    point_grid, points_from_grid = _grid(points)
+    vertex_grid, part_from_grid = _grid(vertices)
+    # as far as any pose takes the cloud, and the part itself
+    corners = [vertices, *(pose.apply(points[:: max(1, len(points) // 500)]) for pose in poses)]
+    half = [np.abs((c - part.center) @ reader_from_part.T).max(axis=0) for c in corners]
+    scene = {
+        "radius": part.radius,
+        "half_mm": np.max(half, axis=0).tolist(),
+        "view": _columns(RigidTransform(reader_from_part, np.zeros(3)).as_matrix()),
+        "mesh": {
+            "vertices": _base64(vertex_grid, "<u2"),
+            "faces": _base64(faces, "<u2"),
+            "model": _columns(local_from_part.as_matrix() @ part_from_grid),
+        },
+        "scan": {
+            "points": _base64(point_grid, "<u2"),
+            "deviation_um": _base64(codes_um, "<i2"),
+            "spacing_mm": min(_DOT * _spacing_mm(points), _LARGEST_DOT * part.radius),
+            "lift_mm": lift_mm,
+        },
+        "poses": [
+            {
+                "name": str(number),
+                "measured": True,
+                "model": _columns((local_from_part @ pose).as_matrix() @ points_from_grid),
+            }
+            for number, pose in enumerate(poses)
+        ],
+        "limit_mm": _CODE_UM / 1000,
+        "colors": _base64(np.round(255 * colors), "u1"),
+        "scan_color": to_rgb(SOURCE_GREEN),
+        "lost_color": to_rgb(NO_PARTNER),
+    }
+    # "<" could end the script element
+    return json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def _view(scene: str, controls: _Controls) -> View3d:
+    """The page around a scene."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("vanejax", "report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    names = ("page.css", "viewer.js", "film.js")
+    style, script, film = (environment.loader.get_source(environment, name)[0] for name in names)
+    scripts = [script, film] if controls.stops else [script]
+    hashes = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts]
+    page = environment.get_template("view3d.html").render(
+        scene=scene,
+        controls=controls,
+        color_bar=color_bar(),
+        style=style,
+        scripts=scripts,
+        policy=" ".join(f"'sha256-{value}'" for value in hashes),
+    )
+    return View3d(page)
