@@ -12,7 +12,7 @@ from vanejax.pairs import Drawing, make_bank
 from vanejax.part import Part
 from vanejax.scan_stream import RandomViews, ScanStream
 from vanejax.scanner import Scanner
-from vanejax.sensor import preset
+from vanejax.sensor import Sensor, preset
 
 _CASTINGS = 0xCA57  # folded into the seed: castings are drawn from another stream than scans
 
@@ -24,6 +24,7 @@ class EndlessSettings:
     Attributes:
       sensor: whose like makes the scans, a name of `vanejax.sensor.PRESETS`; empty for the fixed
         scans.
+      effects: off for an ideal camera of the same pixels, view and range in the sensor's place.
       distance_mm: (least, most) from the camera to the part's centre.
       elevation_deg: (least, most) above the part's xy plane.
       resolution: share of the sensor's pixels per side.
@@ -33,6 +34,7 @@ class EndlessSettings:
     """
 
     sensor: str = ""
+    effects: bool = True
     distance_mm: tuple[float, float] = (300.0, 500.0)
     elevation_deg: tuple[float, float] = (40.0, 90.0)
     resolution: float = 0.25
@@ -64,7 +66,7 @@ class EndlessSettings:
         return ScanStream(
             part=part,
             reference=make_bank(scans, num_reference=drawing.num_reference).reference,
-            sensor=preset(self.sensor).scaled(self.resolution),
+            sensor=self._kind().scaled(self.resolution),
             views=RandomViews(distance_mm=self.distance_mm, elevation_deg=self.elevation_deg),
             castings=[Scanner(casting) for casting in self.cast(part, seed)],
             batch_size=batch_size,
@@ -73,6 +75,10 @@ class EndlessSettings:
             voxel_mm=float(scans.source["voxel_mm"]),
             seed=seed,
         )
+
+    def _kind(self) -> Sensor:
+        sensor = preset(self.sensor)
+        return sensor if self.effects else Sensor(camera=sensor.camera)
 
     def cast(self, part: Part, seed: int) -> list[Part]:
         """The parts that are scanned."""

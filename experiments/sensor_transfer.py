@@ -1,13 +1,13 @@
-"""What a network that saw virtual scans is worth on real ones, by the sensor that made them.
+"""What a network that saw virtual scans is worth on real ones, by how real the virtual ones were.
 
-python -m experiments.sensor_transfer FOLDER [--sensors ideal,consumer_depth] [--steps 1000]
-    [--starts 10] [--out DIR]
+python -m experiments.sensor_transfer FOLDER [--sensor consumer_depth] [--steps 1500]
+    [--starts 20] [--out DIR]
 
-FOLDER is that of `experiments.real_scans`. For each part there an RPM-Net is trained with scans by
-each sensor, alike in everything else: views, distances, seed and steps. Every network then
-registers the real scans of its part from the same rough poses up to 45 deg and half a part radius
-away, alone and with the fine registration after it. An interrupted run goes on where it stopped.
-Results: a table and sensor_transfer.json in ``--out``.
+FOLDER is that of `experiments.real_scans`. For each part there two RPM-Nets are trained on virtual
+scans: by the sensor, and by an ideal camera of the same pixels and range. All else is alike: views,
+distances, noise added, seed and steps. Both then register the real scans from the same rough poses
+up to 45 deg and half a part radius away, alone and with the fine registration after it. An
+interrupted run goes on where it stopped. Results: a table and sensor_transfer.json in ``--out``.
 """
 
 from __future__ import annotations
@@ -50,13 +50,15 @@ from vanejax.surface import Surface
 
 START_DEG, START_SHARE = 45.0, 0.5  # of the part's radius
 DISTANCES_MM = (170.0, 390.0)  # between which the real scans were taken
+IDEAL = "ideal"  # the network that saw no effects
+NO_NETWORK = "no network"
 _STARTS = 0x7247  # folded into the seed
 
 
-def recipe(known: Known, sensor: str, *, steps: int, seed: int) -> Experiment:
-    """The training for one part by one sensor; only ``endless.sensor`` tells two of them apart."""
+def recipe(known: Known, sensor: str, *, effects: bool, steps: int, seed: int) -> Experiment:
+    """The training for one part; only ``endless.effects`` tells two of them apart."""
     return Experiment(
-        name=f"{known.cad.stem}_{sensor}",
+        name=f"{known.cad.stem}_{sensor if effects else IDEAL}",
         seed=seed,
         part=PartSettings(path=str(known.cad), units=known.cad_units),
         data=DataSettings(num_reference=512),
@@ -64,8 +66,9 @@ def recipe(known: Known, sensor: str, *, steps: int, seed: int) -> Experiment:
             sensor=sensor,
             distance_mm=DISTANCES_MM,
             elevation_deg=(-90.0, 90.0),
-            # the ideal sensor has the paper's camera, three times finer than the depth camera
-            resolution=1.0 if preset(sensor).camera.width < 500 else 1 / 3,
+            effects=effects,
+            # as many pixels as the depth camera has
+            resolution=min(1.0, 424 / preset(sensor).camera.width),
         ),
         loss=LossSettings(matching=0.02, matching_sigma=0.02),
         training=TrainingSettings(steps=steps, learning_rate=2e-3, quick_compilation=False),
@@ -113,7 +116,7 @@ class Trial:
                 }
         for row, init in zip(rows, inits, strict=True):
             row["start"] = _errors(known, init)
-            row["no network"] = {
+            row[NO_NETWORK] = {
                 "refined": _errors(known, refine(self._model, points, init).part_from_camera)
             }
         return rows
@@ -181,15 +184,13 @@ def table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def sensor_names(text: str) -> tuple[str, ...]:
-    """Comma-separated presets of `vanejax.sensor`, as an argument's type."""
-    names = tuple(text.split(","))
-    for name in names:
-        try:
-            preset(name)
-        except InputError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
-    return tuple(dict.fromkeys(names))
+def sensor_name(text: str) -> str:
+    """A preset of `vanejax.sensor`, as an argument's type."""
+    try:
+        preset(text)
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
 
 
 def main(settings: argparse.Namespace) -> dict[str, Any]:
@@ -199,9 +200,11 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     rows: dict[str, list[dict[str, Any]]] = {}
     for first in {known.cad: known for known in truth}.values():
         networks = {}
-        for sensor in settings.sensors:
-            config = recipe(first, sensor, steps=settings.steps, seed=settings.seed)
-            networks[sensor] = network(config, settings.out / config.name)
+        for name, effects in ((IDEAL, False), (settings.sensor, True)):
+            config = recipe(
+                first, settings.sensor, effects=effects, steps=settings.steps, seed=settings.seed
+            )
+            networks[name] = network(config, settings.out / config.name)
         trial = Trial(config.make_part(), networks)
         scans = [known for known in truth if known.cad == first.cad]
         rows[first.cad.stem] = [
@@ -213,7 +216,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
                 rng=np.random.default_rng([settings.seed, _STARTS, number]),
             )
         ]
-    names = [*settings.sensors, "no network"]
+    names = [IDEAL, settings.sensor, NO_NETWORK]
     together = [row for found in rows.values() for row in found]
     report |= {
         "summary": {"all": summarize(together, names)}
@@ -230,14 +233,14 @@ def make_parser() -> argparse.ArgumentParser:
     parser = study.make_parser("sensor_transfer", __doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="as experiments.real_scans")
     parser.add_argument(
-        "--sensors",
-        type=sensor_names,
-        default=("ideal", "consumer_depth"),
-        metavar="NAMES",
-        help="whose scans to train on (ideal,consumer_depth)",
+        "--sensor",
+        type=sensor_name,
+        default="consumer_depth",
+        metavar="NAME",
+        help="whose scans one network is trained on (consumer_depth)",
     )
-    parser.add_argument("--steps", type=study.count, default=1000, help="of each training (1000)")
-    parser.add_argument("--starts", type=study.count, default=10, help="rough poses a scan (10)")
+    parser.add_argument("--steps", type=study.count, default=1500, help="of each training (1500)")
+    parser.add_argument("--starts", type=study.count, default=20, help="rough poses a scan (20)")
     return parser
 
 
