@@ -48,7 +48,10 @@ X90_THEN_Z90 = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]  # x goes to y, y to z, z to x
 
 
 def frame(rotation: Rotation) -> RigidTransform:
-    return RigidTransform(rotation.as_matrix(), np.array([812.34567, -45.00004, 1300.5]))
+    """A composed pose, as all are: every entry is rounded by itself, the small ones too."""
+    first = pose((10.0, 20.0, 30.0), (0.0, 0.0, 0.0)).rotation
+    matrix = first @ (first.T @ rotation.as_matrix())
+    return RigidTransform(matrix, np.array([812.34567, -45.00004, 1300.5]))
 
 
 @pytest.mark.parametrize("name", list(NOTATIONS))

@@ -76,7 +76,8 @@ def test_a_face_without_area_does_no_harm() -> None:
     vertices = np.array([[0.0, 0, 0], [30, 0, 0], [30, 30, 0], [0, 30, 0], [15, 0, 0]])
     mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [0, 2, 3], [0, 4, 1]], process=False)
     feet = NearestFace(Part(mesh=mesh, name="sheet", notes=(), closed=False)).feet(
-        np.array([[10.0, 5, 2], [40.0, 5, 0]])
+        np.array([[10.0, 5, 2], [40.0, 5, 0], [14.0, -5, 0]])
     )
-    np.testing.assert_allclose(feet.points, [[10, 5, 0], [30, 5, 0]], rtol=0, atol=1e-12)
+    expected = [[10, 5, 0], [30, 5, 0], [14, 0, 0]]
+    np.testing.assert_allclose(feet.points, expected, rtol=0, atol=1e-12)
     assert set(feet.face) <= {0, 1}
