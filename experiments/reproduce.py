@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments import study
-from experiments.reproduction_live import Live, evaluate_live
+from experiments.reproduction_live import Live, evaluate_live, measure_position
 from experiments.reproduction_page import Document, document, to_markdown, to_page
 from experiments.reproduction_studies import (
     ROOT,
@@ -88,8 +88,13 @@ def quick(out: Path, weights: str) -> Reproduction:
     matcher = find_weights(weights, guide_vane())
     words = "those that come with the package" if weights == WORD else Path(weights).name
     live = evaluate_live(matcher, words, out)
-    mode = f"{RECORDED} The weights were evaluated afresh, and their pictures drawn, for this page."
-    report = document(recorded(), mode, live=live, docs=DOCS, run=out)
+    live = dataclasses.replace(live, position=measure_position(out))
+    results = recorded()
+    results.setdefault("position", live.position)
+    mode = (
+        f"{RECORDED} For this page the weights were evaluated and the virtual stand was run again."
+    )
+    report = document(results, mode, live=live, docs=DOCS, run=out)
     _write(page, report)
     return Reproduction(page, live=live)
 

@@ -1,4 +1,4 @@
-"""What the report measures afresh: the shipped network on the test views."""
+"""What the report measures afresh: the shipped network on the test views, and the stand."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from experiments import position
 from experiments.configs import vane
 from experiments.evaluate import evaluate
 from experiments.experiment import Experiment
@@ -26,12 +27,14 @@ class Live:
       weights: the network's file or origin, in words.
       trained: the commit that it was trained from, as far as known.
       seconds: scans, registrations and pictures.
+      position: what `experiments.position` found, where it was run.
     """
 
     report: dict[str, Any]
     weights: str
     trained: str | None
     seconds: float
+    position: dict[str, Any] | None = None
 
 
 def evaluate_live(
@@ -65,6 +68,12 @@ def evaluate_live(
     report = evaluate(config, scans, matcher.variables, folder, part=part, progress=progress)
     seconds = time.perf_counter() - began
     return Live(report, weights, matcher.trained.get("commit"), seconds)
+
+
+def measure_position(out: Path) -> dict[str, Any]:
+    """The study of the virtual stand as it is recorded; its files go to the folder position."""
+    settings = position.make_parser().parse_args(["--out", str(out / "position")])
+    return position.main(settings)
 
 
 def check_recipe(matcher: TrainedMatcher, config: Experiment) -> None:

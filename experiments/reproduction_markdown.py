@@ -11,6 +11,8 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 
 _INLINE = re.compile(r"`([^`]+)`|\*\*(.+?)\*\*|\[([^\]]+)\]\(([^)\s]+)\)")
+_NUMBER = re.compile(r"[+−-]?[\d.,]+ ?%?")
+_SHORT = re.compile(r"`[^` ]{1,30}`|\d{4}-\d\d-\d\d")
 _WIDE = 8  # columns from which a table is set smaller
 
 
@@ -95,9 +97,15 @@ def _code(lines: Sequence[str], name: str) -> str:
 def _table(lines: Sequence[str], name: str) -> str:
     head, rows = cells(lines[0]), [cells(line) for line in lines[2:]]
     kind = ' class="wide"' if len(head) > _WIDE else ""
-    titles = "".join(f'<th scope="col">{inline(cell)}</th>' for cell in head)
+    places = [_kind([row[column] for row in rows]) for column in range(len(head))]
+    titles = "".join(
+        f'<th scope="col"{place}>{inline(cell)}</th>'
+        for cell, place in zip(head, places, strict=True)
+    )
     body = "".join(
-        "<tr>" + "".join(f"<td{_kind(cell)}>{inline(cell)}</td>" for cell in row) + "</tr>"
+        "<tr>"
+        + "".join(f"<td{p}>{inline(cell)}</td>" for cell, p in zip(row, places, strict=True))
+        + "</tr>"
         for row in rows
     )
     table = f"<table{kind}><thead><tr>{titles}</tr></thead><tbody>{body}</tbody></table>"
@@ -116,9 +124,14 @@ def cells(line: str) -> list[str]:
     return [part.strip().replace("\\|", "|") for part in parts]
 
 
-def _kind(cell: str) -> str:
-    """Numbers stand to the right."""
-    return ' class="n"' if re.fullmatch(r"[−-]?[\d.,]+ ?%?", cell) else ""
+def _kind(column: Sequence[str]) -> str:
+    """Columns of numbers stand to the right, short codes and dates in one line."""
+    told = [cell for cell in column if cell]
+    if told and all(_NUMBER.fullmatch(cell) for cell in told):
+        return ' class="n"'
+    if told and all(_SHORT.fullmatch(cell) for cell in told):
+        return ' class="k"'
+    return ""
 
 
 def row(values: Sequence[str]) -> str:

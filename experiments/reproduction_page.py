@@ -7,6 +7,7 @@ import dataclasses
 import datetime
 import html
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -72,7 +73,8 @@ th, td { text-align: left; vertical-align: top; padding: 7px 14px 7px 0;
   border-bottom: 1px solid var(--line); }
 th { font-weight: 600; color: var(--soft); border-bottom: 1px solid var(--soft);
   vertical-align: bottom; }
-td.n { text-align: right; }
+th.n, td.n { text-align: right; }
+td.k { white-space: nowrap; }
 table.wide { font-size: 12.5px; }
 table.wide th, table.wide td { padding: 5px 10px 5px 0; }
 pre { margin: 0; padding: 14px 16px; background: var(--well); border-radius: 8px; font-size: 12px;
@@ -88,17 +90,20 @@ figcaption { color: var(--soft); font-size: 14px; margin: 8px auto 0; max-width:
 .verdict::before { content: ""; display: inline-block; width: 9px; height: 9px; margin-right: 6px;
   border-radius: 50%; background: currentColor; }
 .good { color: var(--good); } .half { color: var(--half); } .bad { color: var(--bad); }
+table.stack td.n { text-align: left; } table.stack th.n { text-align: left; }
 .none { color: var(--none); } .none::before { background: none; border: 1.5px solid; }
 @media (max-width: 700px) {
   main, header, footer { padding-left: 16px; padding-right: 16px; }
   header { padding-top: 24px; }
   h1 { font-size: 27px; } h2 { font-size: 20px; margin-top: 40px; }
   nav ol { columns: 1; }
+  table:not(.stack) { min-width: 620px; }
   .stack thead { position: absolute; width: 1px; height: 1px; overflow: hidden;
     clip-path: inset(50%); }
   .stack, .stack tbody, .stack tr, .stack td { display: block; }
   .stack tr { padding: 10px 0; border-bottom: 1px solid var(--line); }
-  .stack td { border: 0; padding: 2px 0 2px 92px; text-align: left; position: relative; }
+  .stack td, .stack td.n { border: 0; padding: 2px 0 2px 92px; text-align: left;
+    position: relative; }
   .stack td::before { content: attr(data-head); position: absolute; left: 0; width: 84px;
     color: var(--soft); font-size: 13px; }
   .stack td:first-child { padding-left: 0; font-weight: 600; }
@@ -114,7 +119,8 @@ figcaption { color: var(--soft); font-size: 14px; margin: 8px auto 0; max-width:
   a { color: inherit; text-decoration: none; }
   nav { background: none; padding: 0; break-inside: avoid; }
   .scroll { overflow: visible; }
-  table { font-size: 7.8pt; }
+  table { font-size: 7.8pt; line-height: 1.3; }
+  th, td { padding: 2.5pt 8pt 2.5pt 0; }
   table.wide { font-size: 6.3pt; }
   table.wide th, table.wide td { padding: 2pt 4pt 2pt 0; }
   thead { display: table-header-group; }
@@ -122,7 +128,7 @@ figcaption { color: var(--soft); font-size: 14px; margin: 8px auto 0; max-width:
   pre { display: block; min-width: 0; background: none; border: .5pt solid var(--line);
     padding: 2mm; font-size: min(8pt, calc(176mm / var(--columns) / .605)); }
   figure { break-inside: avoid; margin: 10pt 0; }
-  figure img { max-height: 200mm; width: auto; max-width: 100%; }
+  figure img { max-height: 150mm; width: auto; max-width: 100%; }
   figcaption { font-size: 8.5pt; }
 }
 """
@@ -296,7 +302,7 @@ def _stacked(text: str) -> str:
     """Tables whose rows a narrow screen shows as blocks: every cell knows its column's head."""
     pieces = text.split("<table>")
     for index, piece in enumerate(pieces[1:], 1):
-        heads = [cell.split("</th>")[0] for cell in piece.split('<th scope="col">')[1:]]
+        heads = re.findall(r'<th scope="col"[^>]*>(.*?)</th>', piece)
         head, _, rest = piece.partition("<tbody>")
         rows = rest.split("<tr>")
         for number, row in enumerate(rows[1:], 1):

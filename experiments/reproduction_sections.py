@@ -6,6 +6,7 @@ Text is Markdown; one document becomes the HTML page and docs/results.md.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +24,7 @@ from experiments import (
     density_report,
     fine,
     performance_page,
+    position_report,
     public_vs_virtual,
     real_scans,
     robustness_report,
@@ -30,14 +32,23 @@ from experiments import (
     sensor_transfer,
     verdict_report,
 )
-from experiments.reproduction_claims import CLAIMS, GOALS, Claim, Results, Verdict, digits
+from experiments.reproduction_claims import (
+    CLAIMS,
+    GOALS,
+    Claim,
+    Results,
+    Verdict,
+    digits,
+    position_errors,
+)
 from experiments.reproduction_live import Live
 from experiments.reproduction_markdown import slug, table
 from experiments.reproduction_studies import BY_RECORD, Outcome
-from experiments.results_page import made_by, text_block, tuning_table, vane_table
+from experiments.results_page import text_block, tuning_table, vane_table
 from vanejax import plotting
 
-ON_PAGE = 4  # series of robustness side by side: more are too small on paper
+ON_PAGE = 3  # series of robustness side by side: more are too small on paper
+LEAST_WIDTH_IN = 9.3  # of their picture, for its legend
 SAME = 0.02  # relative: a live figure that differs by less is called the same
 PAPER_SERIES = ("distance", "angle", "light")
 SIGNS = {
@@ -133,19 +144,14 @@ def counts(claims: Sequence[Claim], results: Results) -> str:
 def judged(name: str, results: Results) -> str:
     """The claims that a section shows the figures of, each with its sentence."""
     rows = []
-    for claim in (*CLAIMS, *GOALS):
-        if claim.section == name:
-            found = claim.finding(results)
-            rows.append(
-                [
-                    f"{claim.place}: {claim.says}" if claim.place else f"Goal: {claim.says}",
-                    claim.published(results),
-                    found.ours,
-                    f"**{SIGNS[found.verdict]}**",
-                    found.because,
-                ]
-            )
-    return table(["claim", "paper or goal", "ours", "verdict", "because"], rows)
+    claims = [claim for claim in (*CLAIMS, *GOALS) if claim.section == name]
+    for claim in claims:
+        found = claim.finding(results)
+        says = f"{claim.place}: {claim.says}" if claim.place else claim.says
+        verdict = f"**{SIGNS[found.verdict]}**"
+        rows.append([says, claim.published(results), found.ours, verdict, found.because])
+    whose = "paper" if all(claim.place for claim in claims) else "goal"
+    return table(["claim", whose, "ours", "verdict", "because"], rows)
 
 
 def sections(results: Results, live: Live | None = None) -> list[Section]:
@@ -186,7 +192,17 @@ def _missing(name: str) -> str:
 
 def origin(results: Results, name: str) -> str:
     """Which record, from where."""
-    return f"Record `{name}.json`: {made_by({'machine': {}, **results[name]})}"
+    report = results[name]
+    commit = str(report["commit"] or "unknown")[:10]
+    return f"Record `{name}.json`: {_machine(report)}; {report['date'][:10]}, commit {commit}."
+
+
+def _machine(report: Mapping[str, Any]) -> str:
+    """What a record was measured on, as far as it says."""
+    machine = report.get("machine", {})
+    name = machine.get("cpu") or machine.get("processor") or report.get("device") or "unknown"
+    cores = machine.get("cores")
+    return f"{name}, {cores} core{'s' if cores != 1 else ''}" if cores else str(name)
 
 
 def _scanner(results: Results, live: Live | None) -> list[str | Picture]:
@@ -243,11 +259,16 @@ def _density(results: Results, _: Live | None) -> list[str | Picture]:
             docs="density.png",
             draw=lambda: density_report.picture(sweeps),
         ),
-        density_report.verdict(sweeps),
+        _in_lines(density_report.verdict(sweeps)),
         text_block("\n\n".join(density_report.table(sweep) for sweep in sweeps)),
         text_block(density_report.LEGEND),
         origin(results, "density"),
     ]
+
+
+def _in_lines(text: str) -> str:
+    """The study's verdict, which is one long paragraph, as a list: a line for each sweep."""
+    return "\n".join(f"- {line}" for line in re.split(r" (?=With more |The scan's |So at )", text))
 
 
 def _methods(results: Results, _: Live | None) -> list[str | Picture]:
@@ -309,36 +330,43 @@ def _against_record(results: Results, live: Live) -> str:
     ]
     if "vane" not in results:
         return "\n".join([*lines, vane_table(live.report)])
-    record, rows, apart = results["vane"], [], []
+    record = results["vane"]
     labels = {
         "rotation_error_deg": "rotation error (deg)",
         "translation_error_mm": "translation error (mm)",
         "ffmde_abs_mm": "FFMDE, absolute (mm)",
         "rmse_mm": "RMSE (mm)",
     }
-    for name, label in labels.items():
-        for column in ("mean", "median", "max"):
-            old, new = (r["summary"][name][column] for r in (record, live.report))
-            rows.append(
-                [f"{label}, {column}", digits(old, 3), digits(new, 3), f"{new / old - 1:+.1%}"]
-            )
-            if abs(new / old - 1) > SAME:
-                apart.append((abs(new / old - 1), f"{label}, {column}"))
-    lines.append(table(["", "recorded", "live", "difference"], rows))
+    pairs = {
+        f"{label}, {column}": tuple(r["summary"][name][column] for r in (record, live.report))
+        for name, label in labels.items()
+        for column in ("mean", "median", "max")
+    }
+    told = _side_by_side(pairs)
+    if live.trained != record.get("commit"):
+        told += (
+            f" The record is of a network trained from commit {str(record['commit'])[:10]}, these "
+            f"weights of one from {str(live.trained)[:10]}."
+        )
+    return "\n".join([*lines, told])
+
+
+def _side_by_side(pairs: Mapping[str, tuple[float, float]]) -> str:
+    """Recorded and live figures, and in a sentence whether they are the same."""
+    rows, apart = [], []
+    for words, (old, new) in pairs.items():
+        change = new / old - 1
+        rows.append([words, digits(old, 3), digits(new, 3), f"{change:+.1%}"])
+        if abs(change) > SAME:
+            apart.append((abs(change), words))
+    told = f"All {len(rows)} figures are the recorded ones within {SAME:.0%}."
     if apart:
-        most = max(apart)
+        size, words = max(apart)
         told = (
             f"{len(apart)} of {len(rows)} figures differ from the record by more than {SAME:.0%}, "
-            f"most the {most[1]} ({most[0]:.0%})."
+            f"most the {words} ({size:.0%})."
         )
-        if live.trained != record.get("commit"):
-            told += (
-                f" The record is of a network trained from commit {str(record['commit'])[:10]}, "
-                f"these weights of one from {str(live.trained)[:10]}."
-            )
-    else:
-        told = f"All {len(rows)} figures are the recorded ones within {SAME:.0%}."
-    return "\n".join([*lines, "", told])
+    return table(["", "recorded", "live", "difference"], rows) + "\n\n" + told
 
 
 def _public(results: Results, _: Live | None) -> list[str | Picture]:
@@ -430,7 +458,41 @@ def _only(report: Mapping[str, Any], names: Sequence[str]) -> Mapping[str, Any]:
 
 
 def _position(results: Results, live: Live | None) -> list[str | Picture]:
-    return [_missing("position") if "position" in BY_RECORD else ""]
+    parts: list[str | Picture] = [
+        "A stage turns the vane about its R axis and moves it along X, Y and Z; each position is "
+        "scanned by a virtual camera with its own errors of calibration and registered, and the "
+        "motion T2 T1^-1 is compared with the stage's or with that of a probe, whose frame a "
+        "scanned and touched cube joins to the camera's."
+    ]
+    if "position" not in results:
+        return [*parts, _missing("position")]
+    report = results["position"]
+    if live is not None and live.position is not None:
+        parts.append(_position_against_record(report, live.position))
+    return [
+        *parts,
+        Picture(
+            "Errors of the recognised turns and moves over the positions of the stage",
+            "The paper's Fig. 15 again: errors of the turns about R and of the moves.",
+            docs="position.png",
+            draw=lambda: position_report.picture(report),
+        ),
+        position_report.table(report),
+        origin(results, "position"),
+    ]
+
+
+def _position_against_record(report: Mapping[str, Any], live: Mapping[str, Any]) -> str:
+    """Whether the stand that was run for the page found what the record says."""
+    if report is live:
+        return "There is no record of this study; it was run for this page."
+    old, new = (position_errors(one) for one in (report, live))
+    pairs = {
+        f"{words}, {column}": (old[name][column], new[name][column])
+        for name, words in (("turns", "rotation (deg)"), ("moves", "translation (mm)"))
+        for column in ("mean", "max")
+    }
+    return "The stand was run again for this page.\n\n" + _side_by_side(pairs)
 
 
 def _bound(results: Results, _: Live | None) -> list[str | Picture]:
@@ -518,13 +580,20 @@ def _clutter(results: Results, _: Live | None) -> list[str | Picture]:
             Picture(
                 f"Errors, FFMDE and RMSE over {words}",
                 f"The same for {words}.",
-                draw=lambda report=report: robustness_report.picture(report),
+                draw=lambda report=report: _wide_enough(robustness_report.picture(report)),
             )
         )
     parts.append(robustness_report.markdown(_only(results["robustness"], names)))
     if results["robustness"]["random"]:
         parts.append(robustness_report.random_lines(results["robustness"]["random"]))
     return [*parts, origin(results, "robustness")]
+
+
+def _wide_enough(figure: Figure) -> Figure:
+    """A picture of few series, with room for the legend."""
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(max(width, LEAST_WIDTH_IN), height)
+    return figure
 
 
 def _speed(results: Results, _: Live | None) -> list[str | Picture]:
@@ -538,9 +607,6 @@ def provenance(results: Results) -> str:
     """Where every number comes from: record, date, commit, machine, seed, command."""
     rows = []
     for name, report in results.items():
-        machine = report.get("machine", {})
-        cpu = machine.get("cpu") or machine.get("processor") or report.get("device") or "unknown"
-        cores = f", {machine['cores']} cores" if machine.get("cores") else ""
         config = report.get("config", {})
         seed = report.get("seed", report.get("seeds", config.get("seed", "–")))
         rows.append(
@@ -548,7 +614,7 @@ def provenance(results: Results) -> str:
                 f"`{name}.json`",
                 str(report["date"])[:10],
                 f"`{str(report['commit'] or 'unknown')[:11]}`",
-                f"{cpu}{cores}",
+                _machine(report),
                 ", ".join(map(str, seed)) if isinstance(seed, list) else str(seed),
                 f"`{BY_RECORD[name].command()}`",
             ]

@@ -215,6 +215,14 @@ STUDIES = (
         ("vane_weights", "vane_robust_weights"),
     ),
     Study(
+        "position",
+        "turns and moves of a part on a virtual stand",
+        ("experiments.position", "--out", "{folder}"),
+        "position.json",
+        "position",
+        0.1,
+    ),
+    Study(
         "fine",
         "fine registration against the Cramer-Rao bound",
         ("experiments.fine", "--out", "{folder}"),
@@ -242,7 +250,7 @@ STUDIES = (
     Study(
         "sensor_effects",
         "what each effect of the sensor does and costs",
-        ("experiments.sensor_effects", "--out", "{folder}"),
+        ("experiments.sensor_effects", "--views", "216", "--out", "{folder}"),
         "sensor_effects.json",
         "sensor_effects",
         0.1,
