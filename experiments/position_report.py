@@ -89,7 +89,7 @@ def table(report: Report) -> str:
         _details(report),
         _predictions(report),
         _frames(report),
-        "Virtual means: the part is its CAD model, the stage's angles are exact, and its moves turn "
+        "Virtual means: the part is its CAD model, the stage's angles are exact, its moves turn "
         "nothing. The probe errs by 0.015 mm along each axis, the cube's faces are flat and square "
         "to 0.02 mm.",
     ]
