@@ -1,9 +1,10 @@
-"""The pictures of docs/how_it_works.md: the scanner, a scene, a casting, a fine registration."""
+"""The pictures of docs/how_it_works.md: scanner, scene, casting, matching, fine registration."""
 
 from __future__ import annotations
 
 import argparse
 
+import jax
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -11,20 +12,27 @@ from experiments import study
 from vanejax import plotting
 from vanejax.camera import Camera, Viewpoints, hemisphere_viewpoints
 from vanejax.casting import Casting, as_cast
+from vanejax.dataset import make_scan_set
 from vanejax.locate import register
 from vanejax.measured_scan import MeasuredScan, clean_scan
 from vanejax.measurement import measure
+from vanejax.model_file import TrainedMatcher
+from vanejax.pairs import draw_pairs, make_bank
+from vanejax.part import Part
 from vanejax.plotting.canvas import FAINT, INK, REFERENCE_RED, SOURCE_GREEN, new_figure, style_chart
 from vanejax.plotting.casting import casting_map
+from vanejax.plotting.matching import Matching, matching_lines
 from vanejax.plotting.segments import segments_picture
 from vanejax.pose_result import PoseResult
+from vanejax.rigid import RigidTransform
 from vanejax.scanner import Scanner
 from vanejax.scene import Clutter, clutter_scene
 from vanejax.segmentation import segment
 from vanejax.sensor import preset
+from vanejax.shipped import find_weights
 from vanejax.vane import guide_vane
 
-VIEW = 20  # of the 216: elevation 60, azimuth 200 deg
+VIEW = 20  # of the 216: elevation 60, azimuth 200 deg, a test view
 SHOWN = (0, 20, 85)  # views whose shadow is drawn
 
 
@@ -86,6 +94,26 @@ def scene_picture(views: Viewpoints, seed: int) -> Figure:
     return segments_picture(scan, camera, scene, segments)
 
 
+def matching_picture(matcher: TrainedMatcher, part: Part, views: Viewpoints, seed: int) -> Figure:
+    """The soft assignment of a noisy test view by the untrained and by the trained network."""
+    one = views.select(np.array([VIEW]))
+    scans = make_scan_set(part, matcher.camera, one, voxel_mm=matcher.voxel_mm, progress=False)
+    bank = make_bank(scans, num_reference=matcher.drawing.num_reference)
+    pairs = draw_pairs(jax.random.key(seed), bank, np.array([0]), matcher.drawing)
+    source, truth = jax.tree.map(lambda leaf: leaf[0], (pairs.source, pairs.target_from_source))
+    model, start = matcher.model, RigidTransform.identity()
+    untrained = model.init(jax.random.key(seed), source, pairs.target, start, 1)
+    real = np.asarray(source.mask)
+    place = part.radius * np.asarray(truth.apply(source.xyz))[real]
+    target = part.radius * np.asarray(pairs.target.xyz)
+    shown = {}
+    for name, variables in (("untrained", untrained), ("trained", matcher.variables)):
+        (match,) = model.apply(variables, source, pairs.target, start, 1)
+        assignment = np.exp(np.asarray(match.log_assignment))[real]
+        shown[f"{name}, first iteration"] = Matching(place, target, assignment)
+    return matching_lines(shown)
+
+
 def main(settings: argparse.Namespace) -> None:
     """Draws them all."""
     part = guide_vane()
@@ -99,6 +127,9 @@ def main(settings: argparse.Namespace) -> None:
         "how_shadow": shadow_picture(scanner, sphere),
         "how_scene": scene_picture(sphere, settings.seed),
         "how_casting": casting_map(part, cast),
+        "how_matching": matching_picture(
+            find_weights(settings.weights, part), part, sphere, settings.seed
+        ),
         "how_deviation": plotting.deviation_map(result, scan, part),
         "how_residuals": plotting.residual_histogram(result),
     }
@@ -110,7 +141,13 @@ def main(settings: argparse.Namespace) -> None:
 
 def make_parser() -> argparse.ArgumentParser:
     """The command's arguments."""
-    return study.make_parser("docs_pictures", __doc__)
+    parser = study.make_parser("docs_pictures", __doc__)
+    parser.add_argument(
+        "--weights",
+        default="shipped",
+        help="an exported network of the guide vane (the one that comes with the package)",
+    )
+    return parser
 
 
 if __name__ == "__main__":
