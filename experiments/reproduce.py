@@ -113,7 +113,7 @@ def full(out: Path, inputs: dict[str, str], only: str | None, plan: bool) -> Rep
     outcomes = run_studies(studies, out, inputs, say=lambda text: print(text, flush=True))
     write_text(out / "outcomes.json", outcomes_json(outcomes))
     mode = "Everything that stands here was trained and measured for this page."
-    _write(page, document(measured(studies, out), mode, outcomes=outcomes, run=out))
+    _write(page, document(measured(chosen(None), out), mode, outcomes=outcomes, run=out))
     return Reproduction(page, tuple(outcomes))
 
 

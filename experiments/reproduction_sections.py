@@ -325,7 +325,8 @@ def _against_record(results: Results, live: Live) -> str:
     """Live and recorded figures side by side, and whether they are the same."""
     lines = [
         f"The weights ({live.weights}) registered the {live.report['views']} test views again in "
-        f"{live.seconds:.0f} s, new scans included.",
+        f"{live.seconds:.0f} s, new scans included ({live.report['date'][:10]}, commit "
+        f"{str(live.report['commit'])[:10]}).",
         "",
     ]
     if "vane" not in results:
@@ -573,13 +574,15 @@ def _clutter(results: Results, _: Live | None) -> list[str | Picture]:
         return [_missing("robustness")]
     names = [s["name"] for s in results["robustness"]["series"] if s["name"] not in PAPER_SERIES]
     parts: list[str | Picture] = []
-    for start in range(0, len(names), ON_PAGE):
-        report = _only(results["robustness"], names[start : start + ON_PAGE])
-        words = ", ".join(series["title"].lower() for series in report["series"])
+    first = len(names) % ON_PAGE  # the few come first: castings stand beside castings
+    for start in ([0] if first else []) + list(range(first, len(names), ON_PAGE)):
+        shown = names[start : first if start < first else start + ON_PAGE]
+        report = _only(results["robustness"], shown)
+        words = "; ".join(series["title"].lower() for series in report["series"])
         parts.append(
             Picture(
                 f"Errors, FFMDE and RMSE over {words}",
-                f"The same for {words}.",
+                f"Drawn as Fig. 11, each network alone (dashed) and refined (full): {words}.",
                 draw=lambda report=report: _wide_enough(robustness_report.picture(report)),
             )
         )

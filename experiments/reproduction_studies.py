@@ -323,12 +323,12 @@ def estimate(studies: Sequence[Study], out: Path, inputs: Mapping[str, str]) -> 
     for study in studies:
         missing = [name for name in study.inputs if name not in inputs]
         if missing:
-            told = f"left out: needs {INPUTS[missing[0]]}"
+            told = f"needs --{missing[0].replace('_', '-')}"
         elif finished(study, out):
             told = "done before"
         else:
             told, total = f"{study.hours:5.2f} h", total + study.hours
-        lines.append(f"{study.name:<20}{told:<14}{study.title}".rstrip())
+        lines.append(f"{study.name:<20}{told:<20}{study.title}".rstrip())
     return "\n".join([*lines, f"{'together, about':<20}{total:5.2f} h on two cores"])
 
 
