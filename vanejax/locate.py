@@ -88,7 +88,8 @@ def register(
         fewer wrong poses can be told from right ones. Of no use with a `MeasuredScan`, which has
         its own.
       init: rough part_from_camera. Poses far from it that fit as well are then no ambiguity.
-      weights: what `vanejax export` wrote for this part, or its path.
+      weights: what `vanejax export` wrote for this part, or its path; "shipped" for those that come
+        with the package, which know the built-in guide vane.
       limits: of the verdict.
       segment: whether table, clamps and chips are taken out of the scan first, see
         `vanejax.segmentation`: "off", "on", or "auto", which does so where the scan is not sound
@@ -106,10 +107,10 @@ def register(
         if not isinstance(part, Part):
             part = load_part(part, units=units_cad, must_be_closed=False)
         if isinstance(weights, str | os.PathLike):
-            from vanejax.model_file import load_model
+            from vanejax.shipped import find_weights
 
-            weights = load_model(weights)
-        if weights is not None:
+            weights = find_weights(weights, part)
+        elif weights is not None:
             weights.check_part(part)
         init = None if init is None else _checked(init)
         if isinstance(scan, np.ndarray):

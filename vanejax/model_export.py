@@ -85,10 +85,19 @@ def export_workdir(
         camera=camera,
         trained={"step": step, "checkpoint": checkpoint}
         | {name: run.get(name) for name in ("versions", "commit", "started")}
-        | {"experiment": config.get("name"), "seed": config.get("seed")},
+        | {"experiment": config.get("name"), "seed": config.get("seed"), "config": config}
+        | {"evaluation": _evaluation(workdir / "evaluation.json")},
     )
     save_model(path, matcher)
     return matcher
+
+
+def _evaluation(path: Path) -> dict[str, Any] | None:
+    """The run's own figures on its test views; None before it was evaluated."""
+    if not path.exists():
+        return None
+    found = _read_json(path)
+    return {name: found[name] for name in ("views", "summary", "date") if name in found}
 
 
 def _drawing(data: dict[str, Any], scans: ScanSet) -> Drawing:
@@ -123,14 +132,19 @@ def _read_weights(workdir: Path, model: RpmNet, checkpoint: Which) -> tuple[Any,
 
 
 def _read_run(path: Path) -> dict[str, Any]:
-    try:
-        run = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; {path.parent} is no training run") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
-    part = run.get("part") if isinstance(run, dict) else None
+    run = _read_json(path)
+    part = run.get("part")
     known = isinstance(part, dict) and all(isinstance(part.get(n), str) for n in ("name", "sha256"))
     if not known or not isinstance(run.get("config"), dict):
         raise InputError(f"{path}: does not say which config and part the run is of")
     return run
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {path.parent} is no training run") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
+    return found if isinstance(found, dict) else {}

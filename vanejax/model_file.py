@@ -15,11 +15,13 @@ from typing import Any
 
 import jax
 import numpy as np
+from scipy.spatial import cKDTree
 
 from vanejax.array_file import read_stored_arrays
 from vanejax.camera import Camera
 from vanejax.errors import InputError
 from vanejax.models.rpmnet import RpmNet
+from vanejax.nearest_face import NearestFace
 from vanejax.pairs import Drawing
 from vanejax.part import Part
 from vanejax.pointcloud import PointCloud
@@ -29,6 +31,7 @@ from vanejax.whole_file import whole_file
 FORMAT = "vanejax matcher"
 VERSION = 1
 MAX_BYTES = 1 << 28
+SAME_SURFACE = 1e-3  # of the radius: how far two files of one part may be apart
 
 # what a header may say: kind, smallest, largest; wide, but no network is beyond
 _MODEL = {
@@ -85,13 +88,31 @@ class TrainedMatcher:
     camera: Camera
     trained: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
+    def knows(self, part: Part) -> bool:
+        """Whether the network was trained for this part, or for the same surface in another file.
+
+        A CAD model written again, or built with other rounding, has another hash; its surface is
+        the same where every reference point lies on it and all of it is near one of them.
+        """
+        if part.sha256 == self.part_sha256:
+            return True
+        slack = SAME_SURFACE * self.radius_mm
+        shift = np.abs(part.center - self.center).max()
+        if max(shift, abs(part.radius - self.radius_mm)) > slack:
+            return False
+        points = self.reference_points.astype(np.float64)
+        off = np.linalg.norm(NearestFace(part).feet(points).points - points, axis=1)
+        gaps, _ = cKDTree(points).query(part.sample(len(points), 0)[0])
+        # no point of a surface is farther from the point that its voxel keeps than its diagonal
+        return bool(off.max() <= slack and gaps.max() <= 2 * self.voxel_mm)
+
     def check_part(self, part: Part) -> None:
         """Refuses a part that the network was not trained for.
 
         Raises:
           InputError: names both parts and their hashes.
         """
-        if part.sha256 != self.part_sha256:
+        if not self.knows(part):
             raise InputError(
                 f"the weights were trained for {self.part_name} (sha256 {self.part_sha256[:12]}), "
                 f"this part is {part.name} (sha256 {part.sha256[:12]}): train for it, give that "

@@ -26,7 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--weights",
         metavar="FILE",
-        help="a matcher trained for this part, from `vanejax export`; works without",
+        help="a matcher trained for this part, from `vanejax export`, or shipped: the one that "
+        "comes with the package, for the built-in vane; works without",
     )
     parser.add_argument(
         "--units-scan",
@@ -95,11 +96,10 @@ def run(arguments: argparse.Namespace) -> int:
     matcher = None
     if arguments.weights is not None:
         from vanejax import compilation_cache
-        from vanejax.model_file import load_model
+        from vanejax.shipped import find_weights
 
         compilation_cache.enable()
-        matcher = load_model(arguments.weights)
-        matcher.check_part(part)
+        matcher = find_weights(arguments.weights, part)
 
     from vanejax.locate import register
 
