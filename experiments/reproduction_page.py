@@ -252,7 +252,7 @@ def to_page(report: Document) -> str:
                 text = to_html(part, name=section.title)
                 body.append(_stacked(text) if number == 0 else text)
         body.append("</section>")
-    body.append(to_html("\n".join(_end(report))))
+    body.append(_stacked(to_html("\n".join(_end(report)))))
     machine = f"{cpu_model()}, {cores()} cores"
     now = datetime.datetime.now().astimezone().isoformat(sep=" ", timespec="minutes")
     made = f"Made {now}, commit {(git_commit() or 'unknown')[:11]}, {machine}."

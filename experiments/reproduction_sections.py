@@ -344,11 +344,10 @@ def _against_record(results: Results, live: Live) -> str:
         for column in ("mean", "median", "max")
     }
     told = _side_by_side(pairs)
-    if live.trained != record.get("commit"):
-        told += (
-            f" The record is of a network trained from commit {str(record['commit'])[:10]}, these "
-            f"weights of one from {str(live.trained)[:10]}."
-        )
+    told += (
+        f" The record was made at commit {str(record['commit'])[:10]}; these weights were trained "
+        f"from commit {str(live.trained)[:10]}."
+    )
     return "\n".join([*lines, told])
 
 

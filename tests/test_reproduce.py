@@ -288,7 +288,7 @@ def test_the_page_tells_of_another_network(results) -> None:
     parts = next(s for s in sections(results, live) if s.name == "views").parts
     text = "\n".join(part for part in parts if isinstance(part, str))
     assert "most the rotation error (deg), max (100%)" in text
-    assert "these weights of one from 0123456789." in text
+    assert "these weights were trained from commit 0123456789." in text
 
 
 @dataclasses.dataclass(frozen=True)
