@@ -287,6 +287,11 @@ def _finish(
         for k in np.flatnonzero(~is_same(turn, shift, part))
     ]
     notes = [*scan.notes, *part.notes]
+    if refinement.allowance_sigma_mm:
+        notes.append(
+            "the stock is taken to be the same all over: what varies of it moves the pose by up to "
+            "as much, which sigma does not know"
+        )
     if init is not None:
         rivals = _near_guess(rivals, init, part, limits, notes)
     verdict = judge(refinement, verification, sure, rivals, radius_mm=part.radius, limits=limits)

@@ -195,7 +195,7 @@ def draw_overlay(axes: Axes, source: np.ndarray, reference: np.ndarray) -> None:
     _draw(axes, [_Dots(reference, REFERENCE_RED, 2.5), _Dots(source, SOURCE_GREEN, 6.5)])
 
 
-def _flat(points: np.ndarray) -> np.ndarray:
+def flattened(points: np.ndarray) -> np.ndarray:
     """Points [N, 3] as the reader sees them: x right, y up, z towards the reader."""
     a, b = np.radians([READER_ELEVATION_DEG, READER_AZIMUTH_DEG])
     eye = np.array([np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)])
@@ -207,7 +207,7 @@ def limits(clouds: Sequence[np.ndarray]) -> np.ndarray:
 
     The one below is for the scale bar.
     """
-    flat = np.concatenate([_flat(cloud)[:, :2] for cloud in clouds])
+    flat = np.concatenate([flattened(cloud)[:, :2] for cloud in clouds])
     flat = flat[np.isfinite(flat).all(axis=1)]
     if not len(flat):
         flat = np.array([[-1.0, -1.0], [1.0, 1.0]])
@@ -230,7 +230,7 @@ def set_limits(axes: Axes, limit: np.ndarray) -> None:
 
 def _draw(axes: Axes, clouds: Sequence[_Dots]) -> None:
     """Clouds as dots, far ones first and paler, so that near points hide far ones."""
-    flat = np.concatenate([_flat(cloud.points) for cloud in clouds])
+    flat = np.concatenate([flattened(cloud.points) for cloud in clouds])
     areas = np.concatenate([np.full(len(cloud.points), cloud.area) for cloud in clouds])
     colors = np.concatenate([np.tile(to_rgb(c.color), (len(c.points), 1)) for c in clouds])
     finite = np.isfinite(flat).all(axis=1)

@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 
 from vanejax.errors import InputError
 from vanejax.plotting.canvas import INK, REFERENCE_RED, SOURCE_GREEN, new_figure
-from vanejax.plotting.clouds import _flat, draw_overlay, height_per_width, limits, set_limits
+from vanejax.plotting.clouds import flattened, draw_overlay, height_per_width, limits, set_limits
 
 _PANEL_IN = 5.2
 _GAP = 1.12  # of the width of what is drawn: how far the scan is moved aside
@@ -119,9 +119,9 @@ def matching_lines(
 def _moved_aside(matching: Matching) -> np.ndarray:
     """The source [N, 3], shifted to the reader's left of the target."""
     both = np.concatenate([matching.source, matching.target])
-    across = _flat(both)[:, 0]
+    across = flattened(both)[:, 0]
     # rows of reader_from_part are the reader's axes in the part's frame
-    right = _flat(np.eye(3))[:, 0]
+    right = flattened(np.eye(3))[:, 0]
     return matching.source - _GAP * float(np.ptp(across)) * right
 
 
@@ -142,7 +142,7 @@ def _strongest(
 def _draw_lines(axes: Axes, ends: np.ndarray, right: np.ndarray, opacity: np.ndarray) -> None:
     """Lines between ends [L, 2, 3] into axes, below the dots; ``right`` [L], ``opacity`` [L]."""
     colors = np.where(right[:, None], to_rgb(_RIGHT_COLOR), to_rgb(_WRONG_COLOR))
-    flat = _flat(ends.reshape(-1, 3))[:, :2].reshape(-1, 2, 2)
+    flat = flattened(ends.reshape(-1, 3))[:, :2].reshape(-1, 2, 2)
     axes.add_collection(
         LineCollection(
             flat, colors=np.concatenate([colors, opacity[:, None]], axis=1), linewidths=0.8,

@@ -28,7 +28,7 @@ from vanejax.plotting.clouds import seen_and_hidden
 from vanejax.plotting.deviation import NO_PARTNER, color_limit_mm
 from vanejax.pose_result import PoseResult
 from vanejax.report.pictures import color_bar
-from vanejax.report.viewer import MAX_POINTS, _base64, _columns, _grid, _spacing_mm, simplified
+from vanejax.report.viewer import MAX_POINTS, columns, simplified, spacing_mm, to_base64, to_grid
 from vanejax.report.viewer import viewer as viewer_of_result
 from vanejax.rigid_transform import RigidTransform
 from vanejax.scanner import Scan
@@ -231,36 +231,36 @@ def _scene(
         np.asarray(part.mesh.vertices, np.float64), np.asarray(part.mesh.faces)
     )
     local_from_part = RigidTransform(np.eye(3), -part.center)
-    point_grid, points_from_grid = _grid(points)
-    vertex_grid, part_from_grid = _grid(vertices)
+    point_grid, points_from_grid = to_grid(points)
+    vertex_grid, part_from_grid = to_grid(vertices)
     # as far as any pose takes the cloud, and the part itself
     corners = [vertices, *(pose.apply(points[:: max(1, len(points) // 500)]) for pose in poses)]
     half = [np.abs((c - part.center) @ reader_from_part.T).max(axis=0) for c in corners]
     scene = {
         "radius": part.radius,
         "half_mm": np.max(half, axis=0).tolist(),
-        "view": _columns(RigidTransform(reader_from_part, np.zeros(3)).as_matrix()),
+        "view": columns(RigidTransform(reader_from_part, np.zeros(3)).as_matrix()),
         "mesh": {
-            "vertices": _base64(vertex_grid, "<u2"),
-            "faces": _base64(faces, "<u2"),
-            "model": _columns(local_from_part.as_matrix() @ part_from_grid),
+            "vertices": to_base64(vertex_grid, "<u2"),
+            "faces": to_base64(faces, "<u2"),
+            "model": columns(local_from_part.as_matrix() @ part_from_grid),
         },
         "scan": {
-            "points": _base64(point_grid, "<u2"),
-            "deviation_um": _base64(codes_um, "<i2"),
-            "spacing_mm": min(_DOT * _spacing_mm(points), _LARGEST_DOT * part.radius),
+            "points": to_base64(point_grid, "<u2"),
+            "deviation_um": to_base64(codes_um, "<i2"),
+            "spacing_mm": min(_DOT * spacing_mm(points), _LARGEST_DOT * part.radius),
             "lift_mm": lift_mm,
         },
         "poses": [
             {
                 "name": str(number),
                 "measured": True,
-                "model": _columns((local_from_part @ pose).as_matrix() @ points_from_grid),
+                "model": columns((local_from_part @ pose).as_matrix() @ points_from_grid),
             }
             for number, pose in enumerate(poses)
         ],
         "limit_mm": _CODE_UM / 1000,
-        "colors": _base64(np.round(255 * colors), "u1"),
+        "colors": to_base64(np.round(255 * colors), "u1"),
         "scan_color": to_rgb(SOURCE_GREEN),
         "lost_color": to_rgb(NO_PARTNER),
     }

@@ -75,24 +75,24 @@ def viewer(result: PoseResult, scan: MeasuredScan, part: Part) -> Viewer:
         np.asarray(part.mesh.vertices, np.float64), np.asarray(part.mesh.faces)
     )
     local_from_part = RigidTransform(np.eye(3), -part.center)
-    point_grid, camera_from_grid = _grid(points)
-    vertex_grid, part_from_grid = _grid(vertices)
+    point_grid, camera_from_grid = to_grid(points)
+    vertex_grid, part_from_grid = to_grid(vertices)
     limit_mm = color_limit_mm(verification)
     reader_from_part = overlay_rotation(scan, part, result.part_from_camera)
     half = np.abs((vertices - part.center) @ reader_from_part.T).max(axis=0)
     scene = {
         "radius": part.radius,
         "half_mm": half.tolist(),
-        "view": _columns(RigidTransform(reader_from_part, np.zeros(3)).as_matrix()),
+        "view": columns(RigidTransform(reader_from_part, np.zeros(3)).as_matrix()),
         "mesh": {
-            "vertices": _base64(vertex_grid, "<u2"),
-            "faces": _base64(faces, "<u2"),
-            "model": _columns(local_from_part.as_matrix() @ part_from_grid),
+            "vertices": to_base64(vertex_grid, "<u2"),
+            "faces": to_base64(faces, "<u2"),
+            "model": columns(local_from_part.as_matrix() @ part_from_grid),
         },
         "scan": {
-            "points": _base64(point_grid, "<u2"),
-            "deviation_um": _base64(_micrometres(deviation), "<i2"),
-            "spacing_mm": _spacing_mm(points),
+            "points": to_base64(point_grid, "<u2"),
+            "deviation_um": to_base64(_micrometres(deviation), "<i2"),
+            "spacing_mm": spacing_mm(points),
             # little enough to hide behind the thinnest wall
             "lift_mm": min(limit_mm, 0.005 * part.radius),
         },
@@ -100,12 +100,12 @@ def viewer(result: PoseResult, scan: MeasuredScan, part: Part) -> Viewer:
             {
                 "name": name,
                 "measured": name == "After",
-                "model": _columns((local_from_part @ pose).as_matrix() @ camera_from_grid),
+                "model": columns((local_from_part @ pose).as_matrix() @ camera_from_grid),
             }
             for name, pose in poses
         ],
         "limit_mm": limit_mm,
-        "colors": _base64(
+        "colors": to_base64(
             np.round(255 * colormaps[DEVIATION_COLORMAP](np.linspace(0, 1, 256))), "u1"
         ),
         "scan_color": to_rgb(SOURCE_GREEN),
@@ -165,7 +165,7 @@ def simplified(
     return means, merged[first], side
 
 
-def _grid(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def to_grid(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points [N, 3] on a grid of 65,535 steps a side, and the matrix [4, 4] that undoes it.
 
     WebGL reads 16-bit integers as 0 to 1. Half a step is 1 micrometre on a part of 130 mm.
@@ -185,7 +185,7 @@ def _micrometres(deviation_mm: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(deviation_mm), _NO_DEVIATION, whole)
 
 
-def _spacing_mm(points: np.ndarray) -> float:
+def spacing_mm(points: np.ndarray) -> float:
     """Typical distance between neighbours among points [N, 3]."""
     if len(points) < 2:
         return 1.0
@@ -193,11 +193,11 @@ def _spacing_mm(points: np.ndarray) -> float:
     return max(float(np.median(cKDTree(points).query(some, k=2)[0][:, 1])), 1e-6)
 
 
-def _base64(values: Sequence[float] | np.ndarray, dtype: str) -> str:
+def to_base64(values: Sequence[float] | np.ndarray, dtype: str) -> str:
     """Little-endian bytes as text."""
     return base64.b64encode(np.ascontiguousarray(values, dtype).tobytes()).decode("ascii")
 
 
-def _columns(matrix: np.ndarray) -> list[float]:
+def columns(matrix: np.ndarray) -> list[float]:
     """A 4x4 matrix as WebGL wants it: column after column."""
     return np.asarray(matrix, np.float64).T.ravel().tolist()
