@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 
 from vanejax.errors import InputError
 from vanejax.plotting.canvas import INK, REFERENCE_RED, SOURCE_GREEN, new_figure
-from vanejax.plotting.clouds import flattened, draw_overlay, height_per_width, limits, set_limits
+from vanejax.plotting.clouds import draw_overlay, flattened, height_per_width, limits, set_limits
 
 _PANEL_IN = 5.2
 _GAP = 1.12  # of the width of what is drawn: how far the scan is moved aside
