@@ -66,7 +66,7 @@ class EndlessSettings:
         return ScanStream(
             part=part,
             reference=make_bank(scans, num_reference=drawing.num_reference).reference,
-            sensor=self._kind().scaled(self.resolution),
+            sensor=self.kind().scaled(self.resolution),
             views=RandomViews(distance_mm=self.distance_mm, elevation_deg=self.elevation_deg),
             castings=[Scanner(casting) for casting in self.cast(part, seed)],
             batch_size=batch_size,
@@ -76,7 +76,8 @@ class EndlessSettings:
             seed=seed,
         )
 
-    def _kind(self) -> Sensor:
+    def kind(self) -> Sensor:
+        """The sensor, or an ideal camera in its place; at full resolution."""
         sensor = preset(self.sensor)
         return sensor if self.effects else Sensor(camera=sensor.camera)
 
