@@ -26,6 +26,7 @@ from absl import flags
 from experiments import command_line
 from experiments.comparison import METHODS
 from experiments.experiment import Experiment
+from experiments.reproduction_studies import STUDIES
 from vanejax import foreign_points
 from vanejax.cli import main, make_parser
 from vanejax.commands.register import EXIT_CODES
@@ -209,6 +210,25 @@ def test_a_wrong_command_is_found(line, folder, monkeypatch) -> None:
     (words,) = commands(line)
     with pytest.raises(AssertionError, match=re.escape(words[0])):
         check(words, monkeypatch)
+
+
+def test_every_program_of_the_pages_is_run_by_reproduce_or_by_a_test() -> None:
+    """What takes hours is run by `experiments.reproduce`, the rest by tests."""
+    named = set()
+    for page in PAGES:
+        text = page.read_text()
+        shell = "\n".join(code for _, code in blocks(text, "sh", "bash", "shell", "console"))
+        for words in [*commands(shell), *inline_commands(text)]:
+            words = [word for word in words if not re.fullmatch(r"\w+=.*", word)]
+            if words[0].rpartition("/")[2] in ("python", "python3"):
+                named.add(words[2])
+    run_by_tests = {
+        f"experiments.{name}": ROOT / "tests" / f"test_{name}.py"
+        for name in ("docs_pictures", "evaluate", "performance_page", "reproduce", "results_page")
+    }
+    assert all(path.exists() for path in run_by_tests.values())
+    studied = {study.arguments[0] for study in STUDIES}
+    assert named - studied - set(run_by_tests) == {"venv", "pytest"}
 
 
 def test_shell_text_falls_into_its_commands() -> None:
