@@ -70,6 +70,7 @@ LAYERS = [
     "noise",
     "covariance",
     "refine",
+    "edge_rounding",
     "verification",
     "verdict",
     "pose_search",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vanejax.covariance import uncertainty
+from vanejax.edge_rounding import check_window, refine_sharpened
 from vanejax.errors import InputError
 from vanejax.foreign_points import attempts, with_others, without_others
 from vanejax.measured_scan import MeasuredScan, clean_scan
@@ -35,6 +36,7 @@ from vanejax.residuals import MeasurementModel, RayCasting, SurfaceMatching
 from vanejax.rigid_transform import RigidTransform
 from vanejax.scan_file import load_scan
 from vanejax.scanner import Scanner
+from vanejax.sensor import Sensor, preset
 from vanejax.surface import Surface
 from vanejax.verdict import Limits, Rival, judge
 from vanejax.verification import View, evidence, verify
@@ -69,6 +71,7 @@ def register(
     limits: Limits | None = None,
     segment: str = "auto",
     max_allowance_mm: float = 0.0,
+    sensor: Sensor | str | None = None,
     seed: int = 0,
 ) -> PoseResult:
     """Finds where a part is in a scan, how sure that is, and whether to trust it.
@@ -96,12 +99,18 @@ def register(
         as it is, or has more than a third of other things. What touches the part may stay.
       max_allowance_mm: for a casting with stock all over that its CAD model lacks: how much at
         most. It is then estimated with the pose, see `vanejax.refine.refine`.
+      sensor: a stereo camera, or a name of `vanejax.sensor.PRESETS`, whose matching window rounds
+        edges off: that is then taken out, see `vanejax.edge_rounding`. Not with an allowance.
       seed: of all random subsets: same seed, same result.
 
     Raises:
       InputError: a file or a value that makes no sense; a part that the weights do not know.
     """
     check_allowance(max_allowance_mm)
+    if isinstance(sensor, str):
+        sensor = preset(sensor)
+    if sensor is not None and max_allowance_mm:
+        raise InputError("a sensor's window and a casting's stock are not taken out together")
     seconds: dict[str, float] = {}
     with _timed(seconds, "read"):
         if not isinstance(part, Part):
@@ -119,7 +128,9 @@ def register(
             scan = load_scan(
                 scan, units=units_scan, part_extent_mm=part.extent_mm, sensor_origin=sensor_origin
             )
-    asked = _Asked(part, init, weights, limits or Limits(), max_allowance_mm, seed, seconds)
+        if sensor is not None:
+            check_window(sensor, scan)
+    asked = _Asked(part, init, weights, limits or Limits(), max_allowance_mm, sensor, seed, seconds)
     results = []
     for segments in attempts(scan, part, segment, seed=seed):
         if segments is None:
@@ -143,6 +154,7 @@ class _Asked:
     weights: TrainedMatcher | None
     limits: Limits
     max_allowance_mm: float
+    sensor: Sensor | None
     seed: int
     seconds: dict[str, float]
 
@@ -267,6 +279,8 @@ def _finish(
             seed=seed,
             max_allowance_mm=asked.max_allowance_mm,
         )
+        if asked.sensor is not None and isinstance(model, RayCasting):
+            refinement = refine_sharpened(model, scan, refinement, asked.sensor, seed=seed)
         pose = refinement.part_from_camera
     with asked.timed("verify"):
         poses = concatenate(_batch(pose), select(poses, slice(1, None)))

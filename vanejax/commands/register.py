@@ -62,6 +62,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MM",
         help="for a casting: how much stock it has all over at most; it is then estimated (0)",
     )
+    parser.add_argument(
+        "--sensor",
+        metavar="NAME",
+        help="a stereo camera whose matching window rounds edges off, which is then taken out of "
+        "the scan: consumer_depth",
+    )
     parser.add_argument("--json", metavar="FILE", help="write the pose and all figures here")
     parser.add_argument("--report", metavar="FILE", help="write an HTML report here")
     parser.add_argument("--seed", type=int, default=0, help="of what is drawn at random (0)")
@@ -111,6 +117,7 @@ def run(arguments: argparse.Namespace) -> int:
         weights=matcher,
         segment=arguments.segment,
         max_allowance_mm=arguments.max_allowance_mm,
+        sensor=arguments.sensor,
         seed=arguments.seed,
     )
     ended = time.perf_counter()
