@@ -6,7 +6,7 @@ FOLDER holds scans, CAD files and ground_truth.json: a list of entries with ``sc
 names), ``scan_units``, ``cad_unit_mm`` and ``scan_from_cad_mm``, the right poses [S][4][4] (several
 for a symmetric part). Errors are those of camera_from_part: the angle, and how far the part's
 origin is off, to the nearest right pose. With ``--sensor``, what that camera's matching window
-rounds off is taken out (`vanejax.edge_rounding`). Results in ``--out``: a table and
+rounds off is taken out as well (`vanejax.edge_rounding`). Results in ``--out``: a table and
 real_scans.json.
 """
 
@@ -188,11 +188,19 @@ def table(report: dict[str, Any]) -> str:
 
 
 def main(settings: argparse.Namespace) -> dict[str, Any]:
-    """The scans of the folder."""
-    rows = measure(load_truth(settings.folder), settings.seed, settings.sensor)
-    report = study.header("register, no guess, no training", settings) | summarize(rows)
+    """The scans of the folder, and again with the sensor known if it is named."""
+    truth = load_truth(settings.folder)
+    report = study.header("register, no guess, no training", settings)
+    report |= summarize(measure(truth, settings.seed))
+    if settings.sensor is not None:
+        report["sensor"] = {"name": settings.sensor} | summarize(
+            measure(truth, settings.seed, settings.sensor)
+        )
     report = study.save(settings.out, "real_scans", report)
     print(table(report))
+    if settings.sensor is not None:
+        print(f"\nwithout what the window of {settings.sensor} rounds off:\n")
+        print(table(report["sensor"]))
     return report
 
 
@@ -201,7 +209,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = study.make_parser("real_scans", __doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help=f"scans, CAD files, {TRUTH}")
     parser.add_argument(
-        "--sensor", metavar="NAME", help="that took the scans, if its window is to be undone"
+        "--sensor", metavar="NAME", help="that took the scans: once more with its window undone"
     )
     return parser
 

@@ -56,6 +56,18 @@ def test_a_folder_becomes_a_table(folder: Path, tmp_path: Path, capsys) -> None:
     printed = capsys.readouterr().out
     assert "pump_1.ply" in printed
     assert "2 of 2 right (within 5 deg and 5 mm)" in printed
+    assert "sensor" not in report
+
+
+def test_a_named_sensor_is_a_second_column(folder: Path, tmp_path: Path, capsys) -> None:
+    arguments = [str(folder), "--out", str(tmp_path), "--sensor", "consumer_depth"]
+    report = main(make_parser().parse_args(arguments))
+    again = report["sensor"]
+    assert (again["name"], again["scans"], again["right"]) == ("consumer_depth", 2, 2)
+    for before, after in zip(report["rows"], again["rows"], strict=True):
+        assert before["scan"] == after["scan"]
+        assert before["rotation_deg"] != after["rotation_deg"]
+    assert "without what the window of consumer_depth rounds off" in capsys.readouterr().out
 
 
 def known(poses: np.ndarray) -> Known:
