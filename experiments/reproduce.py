@@ -20,18 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from experiments import study
-from experiments.reproduction_live import Live, evaluate_live, measure_position
-from experiments.reproduction_page import Document, document, to_markdown, to_page
-from experiments.reproduction_studies import (
-    ROOT,
-    Outcome,
-    chosen,
-    estimate,
-    measured,
-    outcomes_json,
-    recorded,
-    run_studies,
-)
+from experiments.reproduction.document import Document, document, to_markdown
+from experiments.reproduction.live import Live, evaluate_live, measure_position
+from experiments.reproduction.page import to_page
+from experiments.reproduction.run import estimate, measured, outcomes_json, run_studies
+from experiments.reproduction.studies import ROOT, Outcome, chosen, recorded
 from vanejax.errors import InputError
 from vanejax.shipped import WORD, find_weights
 from vanejax.vane import guide_vane

@@ -26,7 +26,7 @@ from absl import flags
 from experiments import command_line
 from experiments.comparison import METHODS
 from experiments.experiment import Experiment
-from experiments.reproduction_studies import STUDIES
+from experiments.reproduction.studies import STUDIES
 from vanejax import foreign_points
 from vanejax.cli import main, make_parser
 from vanejax.commands.register import EXIT_CODES

@@ -16,24 +16,35 @@ import numpy as np
 import pytest
 from headless_browser import CHROMIUM, HeadlessBrowser
 
-from experiments import reproduce, reproduction_live, reproduction_studies
+from experiments import reproduce
 from experiments.configs import smoke, vane
 from experiments.public_vs_virtual import PUBLIC, VIRTUAL
-from experiments.reproduction_claims import CLAIMS, GOALS, Claim, Verdict, digits
-from experiments.reproduction_live import Live, check_recipe
-from experiments.reproduction_markdown import cells, inline, slug, table, to_html
-from experiments.reproduction_page import document, to_markdown, to_page
-from experiments.reproduction_sections import TITLES, _axis_errors, _side_by_side, sections
-from experiments.reproduction_studies import (
+from experiments.reproduction import live as live_module
+from experiments.reproduction import studies
+from experiments.reproduction.claim import Claim, Verdict, digits
+from experiments.reproduction.contents import (
+    CLAIMS,
+    GOALS,
+    OF_OURS,
+    OF_PAPER,
+    TOPICS,
+    sections,
+)
+from experiments.reproduction.document import document, to_markdown
+from experiments.reproduction.live import Live, check_recipe, side_by_side
+from experiments.reproduction.markdown import cells, inline, slug, table, to_html
+from experiments.reproduction.page import to_page
+from experiments.reproduction.run import estimate, run_studies
+from experiments.reproduction.studies import (
     BY_RECORD,
     RESULTS,
     STUDIES,
     Study,
     chosen,
-    estimate,
     recorded,
-    run_studies,
 )
+from experiments.reproduction.topics.training import axis_errors
+from experiments.reproduction.topics.views import VIEWS
 from vanejax.errors import InputError
 from vanejax.metrics import mean_per_axis, mean_per_view
 from vanejax.vane import guide_vane
@@ -229,11 +240,12 @@ def test_what_is_missing_is_said_to_be(results) -> None:
             assert f"there is no result {study.record}." in text, study.name
 
 
-def test_every_section_has_claims_of_one_kind() -> None:
-    for name in TITLES:
-        kinds = {bool(one.place) for one in (*CLAIMS, *GOALS) if one.section == name}
-        assert len(kinds) == 1, name
-    assert {one.section for one in (*CLAIMS, *GOALS)} == set(TITLES)
+def test_every_topic_is_on_the_page_with_claims_of_one_kind() -> None:
+    assert len(TOPICS) == len(set(TOPICS))
+    assert set(TOPICS) == {*OF_PAPER, *OF_OURS}
+    assert all(topic.claims for topic in TOPICS)
+    assert all(one.place for one in CLAIMS)
+    assert not any(one.place for one in GOALS)
 
 
 @pytest.mark.parametrize(
@@ -253,7 +265,7 @@ def test_the_axis_errors_drawn_have_the_recorded_means(results, monkeypatch) -> 
     monkeypatch.setattr("vanejax.plotting.axis_errors", lambda series: drawn.update(series))
     report = results["public_vs_virtual"]
     for views in ("hardest", "all"):
-        _axis_errors(report, views)
+        axis_errors(report, views)
         for source in (PUBLIC, VIRTUAL):
             errors = drawn[report["trained_on"][source]["title"]]
             found = report[f"{views}_views"][source]
@@ -274,9 +286,9 @@ def test_the_axis_errors_drawn_have_the_recorded_means(results, monkeypatch) -> 
 
 
 def test_live_figures_are_held_against_the_record() -> None:
-    same = _side_by_side({"a": (1.0, 1.01), "b": (2.0, 1.99)})
+    same = side_by_side({"a": (1.0, 1.01), "b": (2.0, 1.99)})
     assert "All 2 figures are the recorded ones within 2%." in same
-    apart = _side_by_side({"a": (1.0, 1.01), "b": (2.0, 1.8), "c": (1.0, 1.05)})
+    apart = side_by_side({"a": (1.0, 1.01), "b": (2.0, 1.8), "c": (1.0, 1.05)})
     assert "2 of 3 figures differ from the record by more than 2%, most the b (10%)." in apart
     assert "| b | 2.00 | 1.80 | -10.0% |" in apart
 
@@ -285,7 +297,7 @@ def test_the_page_tells_of_another_network(results) -> None:
     report = copy.deepcopy(results["vane"])
     report["summary"]["rotation_error_deg"]["max"] *= 2
     live = Live(report, "w.npz", "0123456789abc", 60.0)
-    parts = next(s for s in sections(results, live) if s.name == "views").parts
+    parts = next(s for s in sections(results, live) if s.topic is VIEWS).parts
     text = "\n".join(part for part in parts if isinstance(part, str))
     assert "most the rotation error (deg), max (100%)" in text
     assert "these weights were trained from commit 0123456789." in text
@@ -333,9 +345,9 @@ def test_the_live_evaluation_scans_anew_with_the_weights_given(tmp_path, monkeyp
         asked.update(scans=scans, variables=variables, folder=folder)
         return {"views": len(scans.test)}
 
-    monkeypatch.setattr(reproduction_live, "evaluate", evaluate)
+    monkeypatch.setattr(live_module, "evaluate", evaluate)
     config = smoke.get_config()
-    live = reproduction_live.evaluate_live(
+    live = live_module.evaluate_live(
         matcher_of(config), "w.npz", tmp_path, config=config, progress=False
     )
     assert asked["variables"] == "weights"
@@ -469,7 +481,7 @@ def test_a_run_goes_on_and_names_what_failed(tmp_path, monkeypatch, capsys) -> N
     asked = dataclasses.replace(
         QUICK_FINE, name="asked", arguments=("x", "{real_scans}"), record=""
     )
-    monkeypatch.setattr(reproduction_studies, "STUDIES", (broken, QUICK_FINE, needy, asked))
+    monkeypatch.setattr(studies, "STUDIES", (broken, QUICK_FINE, needy, asked))
     settings = reproduce.make_parser().parse_args(["--out", str(tmp_path)])
     assert reproduce.main(settings) == 1
     page = (tmp_path / reproduce.FILE).read_text()

@@ -1,47 +1,33 @@
-"""The report as one HTML file for screen and paper, and as Markdown for docs/results.md."""
+"""The report as one HTML file for screen and paper."""
 
 from __future__ import annotations
 
 import base64
-import dataclasses
 import datetime
 import html
 import io
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.image import imread
 
 from experiments.machine import cores, cpu_model
-from experiments.reproduction_claims import CLAIMS, GOALS, Results
-from experiments.reproduction_live import Live
-from experiments.reproduction_markdown import slug, to_html
-from experiments.reproduction_sections import (
-    Picture,
-    Section,
-    counts,
-    outcomes_table,
-    picture_file,
-    provenance,
-    sections,
-    summary,
+from experiments.reproduction.claim import Verdict
+from experiments.reproduction.document import (
+    HOW_TO_READ,
+    PAPER,
+    SOURCES,
+    SUMMARIES,
+    TITLE,
+    WAS_RUN,
+    Document,
+    closing,
+    summaries,
 )
-from experiments.reproduction_studies import Outcome
+from experiments.reproduction.markdown import slug, to_html
+from experiments.reproduction.topic import Picture
 from experiments.run_folder import git_commit
 
-TITLE = "The paper, measured again"
-PAPER = (
-    "“Simulation of Self-Occlusion Virtual Dataset Method for Robust Point Matching Algorithm, "
-    "With Applications to Positioning of Guide Vanes”"
-)
-HOW_TO_READ = (
-    "The paper's figures are of its own vanes, camera and machine, which nobody else has; ours are "
-    "of the parametric guide vane built in here, under virtual sensors unless a section says real. "
-    "RMSE and FFMDE are not 0 at the true pose but what noise and the spacing of the points make "
-    "of them: where ours is no more than that, the row says not comparable, whichever is lower. "
-    "Every verdict and every sentence beside it is computed from the figures."
-)
 PICTURE_DPI = 110
 
 STYLE = """
@@ -133,133 +119,37 @@ table.stack td.n { text-align: left; } table.stack th.n { text-align: left; }
 }
 """
 _KINDS = {
-    "better": "good",
-    "met": "good",
-    "partly met": "half",
-    "not met": "bad",
-    "not comparable": "none",
-    "not measured": "none",
+    Verdict.BETTER.value: "good",
+    Verdict.MET.value: "good",
+    Verdict.PARTLY.value: "half",
+    Verdict.MISSED.value: "bad",
+    Verdict.INCOMPARABLE.value: "none",
+    Verdict.UNKNOWN.value: "none",
     "failed": "bad",
     "not run": "none",
 }
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Document:
-    """What the report says.
-
-    Attributes:
-      results: by record's name.
-      mode: how they came about, in a sentence.
-      sections: of the page.
-      outcomes: of a run's studies; none where recorded results are shown.
-      docs, run: folders of pictures, as far as there are any.
-    """
-
-    results: Results
-    mode: str
-    sections: Sequence[Section]
-    outcomes: Sequence[Outcome] = ()
-    docs: Path | None = None
-    run: Path | None = None
-
-
-def document(
-    results: Results,
-    mode: str,
-    *,
-    live: Live | None = None,
-    outcomes: Sequence[Outcome] = (),
-    docs: Path | None = None,
-    run: Path | None = None,
-) -> Document:
-    """The report of some results; see `Document`."""
-    return Document(results, mode, sections(results, live), outcomes, docs, run)
-
-
-def to_markdown(report: Document) -> str:
-    """docs/results.md: no date and no machine but those of the records."""
-    lines = [
-        f"# {TITLE}",
-        "",
-        f"{PAPER}: every table and figure, with the paper's value, ours, and what follows. "
-        f"{report.mode}",
-        "",
-        HOW_TO_READ,
-        "",
-        *_top(report),
-    ]
-    for section in report.sections:
-        lines += [f"## {section.title}", ""]
-        for part in section.parts:
-            text = _markdown_picture(part) if isinstance(part, Picture) else part
-            lines += [text, ""] if text else []
-    lines += _end(report)
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def _top(report: Document) -> list[str]:
-    """The two summaries, as Markdown."""
-    results = report.results
-    return [
-        "## What the paper claims",
-        "",
-        f"{counts(CLAIMS, results)}.",
-        "",
-        summary(CLAIMS, results, paper=True),
-        "",
-        "## What the paper has not",
-        "",
-        f"{counts(GOALS, results)}.",
-        "",
-        summary(GOALS, results, paper=False),
-        "",
-    ]
-
-
-def _end(report: Document) -> list[str]:
-    """Provenance and, of a run, what became of its studies, as Markdown."""
-    lines = []
-    if report.outcomes:
-        lines += ["## What was run", "", outcomes_table(report.outcomes), ""]
-    return [
-        *lines,
-        "## Where every number comes from",
-        "",
-        "Tables and sentences are made from these records and from nothing else; "
-        "`python -m experiments.reproduce` runs all the commands, one after the other. A `+` after "
-        "a commit: the source tree had changes.",
-        "",
-        provenance(report.results),
-        "",
-    ]
-
-
-def _markdown_picture(picture: Picture) -> str:
-    return f"![{picture.alt}]({picture.docs})\n\n{picture.caption}" if picture.docs else ""
-
-
 def to_page(report: Document) -> str:
     """The HTML file's text: no script, no request, every picture inside."""
-    body = [f"<p>{html.escape(HOW_TO_READ)}</p>", _stacked(to_html("\n".join(_top(report))))]
+    body = [f"<p>{html.escape(HOW_TO_READ)}</p>", _stacked(to_html(summaries(report)))]
     for section in report.sections:
-        body.append(f'<section aria-labelledby="{section.anchor}">')
-        body.append(f'<h2 id="{section.anchor}">{html.escape(section.title)}</h2>')
+        topic = section.topic
+        body.append(f'<section aria-labelledby="{topic.anchor}">')
+        body.append(f'<h2 id="{topic.anchor}">{html.escape(topic.title)}</h2>')
         for number, part in enumerate(section.parts):
             if isinstance(part, Picture):
                 body.append(_figure(part, report))
             else:
-                text = to_html(part, name=section.title)
+                text = to_html(part, name=topic.title)
                 body.append(_stacked(text) if number == 0 else text)
         body.append("</section>")
-    body.append(_stacked(to_html("\n".join(_end(report)))))
+    body.append(_stacked(to_html(closing(report))))
     machine = f"{cpu_model()}, {cores()} cores"
     now = datetime.datetime.now().astimezone().isoformat(sep=" ", timespec="minutes")
     made = f"Made {now}, commit {(git_commit() or 'unknown')[:11]}, {machine}."
-    titles = ["What the paper claims", "What the paper has not"]
-    titles += [section.title for section in report.sections]
-    titles += ["What was run"] if report.outcomes else []
-    titles += ["Where every number comes from"]
+    titles = [*SUMMARIES, *(section.topic.title for section in report.sections)]
+    titles += [WAS_RUN, SOURCES] if report.outcomes else [SOURCES]
     contents = "".join(
         f'<li><a href="#{slug(title)}">{html.escape(title)}</a></li>' for title in titles
     )
@@ -321,7 +211,7 @@ def _figure(picture: Picture, report: Document) -> str:
         picture.draw().savefig(buffer, format="png", dpi=PICTURE_DPI, metadata={"Software": None})
         data = buffer.getvalue()
     else:
-        path = picture_file(picture, docs=report.docs, run=report.run)
+        path = _file(picture, report)
         if path is None:
             return ""
         data = path.read_bytes()
@@ -332,3 +222,11 @@ def _figure(picture: Picture, report: Document) -> str:
         f'style="--width: {width}px" alt="{html.escape(picture.alt)}">'
         f"<figcaption>{html.escape(picture.caption)}</figcaption></figure>"
     )
+
+
+def _file(picture: Picture, report: Document) -> Path | None:
+    """The file of a picture that is not drawn: the run's, or the recorded one; None if neither."""
+    for folder, name in ((report.run, picture.run), (report.docs, picture.docs)):
+        if folder is not None and name and (folder / name).is_file():
+            return folder / name
+    return None

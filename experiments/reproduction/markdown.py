@@ -134,11 +134,10 @@ def _kind(column: Sequence[str]) -> str:
     return ""
 
 
-def row(values: Sequence[str]) -> str:
-    """A table's row of Markdown."""
-    return "| " + " | ".join(value.replace("|", "\\|") for value in values) + " |"
-
-
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table of Markdown."""
-    return "\n".join([row(head), "|" + "---|" * len(head), *map(row, rows)])
+    return "\n".join([_row(head), "|" + "---|" * len(head), *map(_row, rows)])
+
+
+def _row(values: Sequence[str]) -> str:
+    return "| " + " | ".join(value.replace("|", "\\|") for value in values) + " |"

@@ -1,9 +1,10 @@
-"""What the report measures afresh: the shipped network on the test views, and the stand."""
+"""What the report measures afresh, the shipped network and the stand, held against the record."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,14 @@ from experiments import position
 from experiments.configs import vane
 from experiments.evaluate import evaluate
 from experiments.experiment import Experiment
+from experiments.reproduction.claim import digits
+from experiments.reproduction.markdown import table
 from experiments.train import load_or_scan
 from vanejax.errors import InputError
 from vanejax.model_file import TrainedMatcher
 
 FOLDER = "vane"  # as that of the study whose pictures these are
+SAME = 0.02  # relative: a live figure that differs by less is called the same
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -105,3 +109,21 @@ def check_recipe(matcher: TrainedMatcher, config: Experiment) -> None:
             f"the weights are of another recipe than {config.name}: {'; '.join(found)}; "
             "give weights exported from a run of it"
         )
+
+
+def side_by_side(pairs: Mapping[str, tuple[float, float]]) -> str:
+    """Recorded and live figures, and in a sentence whether they are the same."""
+    rows, apart = [], []
+    for words, (old, new) in pairs.items():
+        change = new / old - 1
+        rows.append([words, digits(old, 3), digits(new, 3), f"{change:+.1%}"])
+        if abs(change) > SAME:
+            apart.append((abs(change), words))
+    told = f"All {len(rows)} figures are the recorded ones within {SAME:.0%}."
+    if apart:
+        size, words = max(apart)
+        told = (
+            f"{len(apart)} of {len(rows)} figures differ from the record by more than {SAME:.0%}, "
+            f"most the {words} ({size:.0%})."
+        )
+    return table(["", "recorded", "live", "difference"], rows) + "\n\n" + told

@@ -1,0 +1,1 @@
+"""What the report tells of: a module for each topic, with its claims, judgements and section."""
