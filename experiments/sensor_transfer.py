@@ -51,7 +51,7 @@ from vanejax.surface import Surface
 START_DEG, START_SHARE = 45.0, 0.5  # of the part's radius
 DISTANCES_MM = (170.0, 390.0)  # between which the real scans were taken
 IDEAL = "ideal"  # the network that saw no effects
-NO_NETWORK = "no network"
+NO_NETWORK = "none: the rough pose"
 _STARTS = 0x7247  # folded into the seed
 
 
@@ -115,10 +115,8 @@ class Trial:
                     "refined": _errors(known, fine),
                 }
         for row, init in zip(rows, inits, strict=True):
-            row["start"] = _errors(known, init)
-            row[NO_NETWORK] = {
-                "refined": _errors(known, refine(self._model, points, init).part_from_camera)
-            }
+            fine = refine(self._model, points, init).part_from_camera
+            row[NO_NETWORK] = {"alone": _errors(known, init), "refined": _errors(known, fine)}
         return rows
 
     def _start(self, known: Known, rng: np.random.Generator) -> RigidTransform:
@@ -143,10 +141,11 @@ def _errors(known: Known, found: RigidTransform) -> dict[str, Any]:
 
 
 def summarize(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str, Any]:
-    """Share that is right, and medians, by network and stage."""
+    """How many are right and their share, and medians, by network and stage."""
     return {
         name: {
             stage: {
+                "registrations": len(rows),
                 "right": float(np.mean([row[name][stage]["right"] for row in rows])),
                 **{
                     error: float(np.median([row[name][stage][error] for row in rows]))
@@ -154,7 +153,6 @@ def summarize(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str,
                 },
             }
             for stage in ("alone", "refined")
-            if stage in rows[0][name]
         }
         for name in names
     }
@@ -163,23 +161,19 @@ def summarize(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str,
 def table(report: dict[str, Any]) -> str:
     """Markdown: a row for each way to train, for all scans and for those of each part."""
     lines = [
-        "| network trained on | part | network: right | deg | mm | refined: right | deg | mm |",
+        "| network trained on | part | by it: right | deg | mm | refined: right | deg | mm |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for part, summary in report["summary"].items():
         for name, stages in summary.items():
             cells = [name, part]
             for stage in ("alone", "refined"):
-                found = stages.get(stage)
-                cells += (
-                    ["", "", ""]
-                    if found is None
-                    else [
-                        f"{found['right']:.0%}",
-                        f"{found['rotation_deg']:.2f}",
-                        f"{found['translation_mm']:.2f}",
-                    ]
-                )
+                found = stages[stage]
+                cells += [
+                    f"{round(found['right'] * found['registrations'])} of {found['registrations']}",
+                    f"{found['rotation_deg']:.2f}",
+                    f"{found['translation_mm']:.2f}",
+                ]
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -221,7 +215,10 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     report |= {
         "summary": {"all": summarize(together, names)}
         | {part: summarize(found, names) for part, found in rows.items()},
-        "rows": together,
+        "scans": {
+            scan: summarize([row for row in together if row["scan"] == scan], names)
+            for scan in dict.fromkeys(row["scan"] for row in together)
+        },
     }
     report = study.save(settings.out, "sensor_transfer", report)
     print(table(report))
