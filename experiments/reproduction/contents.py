@@ -56,19 +56,18 @@ class Section:
 def sections(results: Results, live: Live | None = None) -> list[Section]:
     """All sections, those without any result too: they say so."""
     return [
-        Section(topic, [judged(topic, results), *topic.parts(results, live)]) for topic in TOPICS
+        Section(topic, [_judged(topic, results), *topic.parts(results, live)]) for topic in TOPICS
     ]
 
 
 def summary(topics: Sequence[Topic], results: Results) -> str:
-    """How the claims of topics stand: a count, and a table with the way to the section."""
-    paper = topics is OF_PAPER
+    """How the claims stand, all the paper's or all ours: a count, and a table that leads on."""
     rows = [
         [*_row(claim, results), f"[{topic.title.split(':')[0]}](#{topic.anchor})"]
         for topic in topics
         for claim in topic.claims
     ]
-    head = ["claim of the paper", "paper"] if paper else ["what", "goal"]
+    head = ["claim of the paper", "paper"] if topics[0].of_paper else ["what", "goal"]
     return f"{_counts(topics, results)}.\n\n" + table([*head, "ours", "verdict", "where"], rows)
 
 
@@ -80,10 +79,10 @@ def _counts(topics: Sequence[Topic], results: Results) -> str:
     return f"{len(verdicts)} in all: {', '.join(told)}"
 
 
-def judged(topic: Topic, results: Results) -> str:
+def _judged(topic: Topic, results: Results) -> str:
     """The claims of a topic, each with the sentence why."""
     rows = [[*_row(claim, results), claim.finding(results).because] for claim in topic.claims]
-    whose = "paper" if topic in OF_PAPER else "goal"
+    whose = "paper" if topic.of_paper else "goal"
     return table(["claim", whose, "ours", "verdict", "because"], rows)
 
 

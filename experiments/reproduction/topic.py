@@ -58,6 +58,11 @@ class Topic:
         """Of the heading."""
         return slug(self.title)
 
+    @property
+    def of_paper(self) -> bool:
+        """Whether its claims are the paper's, not goals of ours."""
+        return all(claim.place for claim in self.claims)
+
     def parts(self, results: Results, live: Live | None) -> list[Part]:
         """Its body, or the word that a result is missing."""
         for name in self.needs:
