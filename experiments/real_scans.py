@@ -187,6 +187,25 @@ def table(report: dict[str, Any]) -> str:
     return "\n".join([*lines, f"{'met' if met else 'MISSED'}: goals are {goal}"])
 
 
+def sensor_table(report: dict[str, Any]) -> str:
+    """Markdown: the scans as they are beside those without what the named sensor rounds off."""
+    lines = [
+        f"| of {report['scans']} scans | right: within {RIGHT_DEG:g} deg, {RIGHT_MM:g} mm | "
+        f"within {NEAR_DEG:g} deg, {NEAR_MM:g} mm | accepted (wrong) | mean (deg) | mean (mm) | "
+        "time (s) |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    sensor = report["sensor"]
+    for name, found in (("as they are", report), (f"`--sensor {sensor['name']}`", sensor)):
+        mean = found["mean_of_right"]
+        lines.append(
+            f"| {name} | {found['right']} | {found['near']} | {found['accepted']} "
+            f"({found['accepted_wrong']}) | {mean['rotation_deg']:.2f} | "
+            f"{mean['translation_mm']:.2f} | {found['seconds']['median']:.2f} |"
+        )
+    return "\n".join(lines)
+
+
 def main(settings: argparse.Namespace) -> dict[str, Any]:
     """The scans of the folder, and again with the sensor known if it is named."""
     truth = load_truth(settings.folder)

@@ -18,8 +18,10 @@ from experiments import (
     comparison_table,
     density_report,
     public_vs_virtual,
+    real_scans,
     robustness_report,
     sensor_fit,
+    sensor_transfer,
 )
 from experiments.marked_page import with_block
 from experiments.methods import TITLES
@@ -40,6 +42,8 @@ NAMES = (
     "ablation_noise",
     "robustness",
     "sensor_fit",
+    "real_scans",
+    "sensor_transfer",
 )
 Report = Mapping[str, Any]
 
@@ -175,7 +179,11 @@ def blocks(results: Mapping[str, Report]) -> dict[Path, dict[str, str]]:
             "random": robustness_report.random_lines(results["robustness"]["random"]),
             "series": dated("robustness", robustness_report.markdown),
         },
-        REAL_SCANS: {"table": dated("sensor_fit", sensor_fit.table)},
+        REAL_SCANS: {
+            "table": dated("sensor_fit", sensor_fit.table),
+            "known sensor": dated("real_scans", real_scans.sensor_table),
+            "trained on": dated("sensor_transfer", sensor_transfer.table),
+        },
     }
 
 
