@@ -202,7 +202,7 @@ STUDIES = (
     _study(
         "real_scans",
         "real depth-camera scans, no training",
-        "experiments.real_scans {real_scans} --out {folder}",
+        "experiments.real_scans {real_scans} --sensor consumer_depth --out {folder}",
         0.02,
     ),
     _study(
