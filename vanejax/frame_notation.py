@@ -102,7 +102,8 @@ def write_iso(machine_from_part: RigidTransform, *, work_offset: int = 1) -> str
 
     G10 L2 P1 sets G54: the part's origin in the machine. G68.2 X Y Z I J K gives a feature
     coordinate system upon the active offset, here with the same origin, turned by Euler angles:
-    I about Z, J about the X so turned, K about the Z turned twice (Fanuc 30i, B-63942EN, 5.44).
+    I about Z, J about the X so turned, K about the Z turned twice (Fanuc; post
+    processors call it EULER_ZXZ_R).
 
     Args:
       machine_from_part: the work frame.
