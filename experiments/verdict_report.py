@@ -38,6 +38,14 @@ def roc(right: np.ndarray, wrong: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return false_accepts, true_accepts
 
 
+def _corners(right: np.ndarray, wrong: np.ndarray) -> list[list[float]]:
+    """The curve of `roc` by its corners alone: false accepts, true accepts."""
+    rates = np.stack(roc(right, wrong), axis=1)
+    steps = np.diff(rates, axis=0)
+    turn = steps[:-1, 0] * steps[1:, 1] != steps[:-1, 1] * steps[1:, 0]
+    return rates[np.concatenate([[True], turn, [True]])].round(4).T.tolist()
+
+
 def area_under_roc(right: np.ndarray, wrong: np.ndarray) -> float:
     """The chance that a right pose's figure exceeds a wrong one's, half for equal ones.
 
@@ -74,6 +82,7 @@ def summarize(
             figures[name] = {
                 "auc": area_under_roc(right, wrong),
                 "true_accepts_at_no_false": float(np.mean(right > wrong.max())),
+                "curve": _corners(right, wrong),
                 "auc_by_kind": {
                     kind: area_under_roc(right, figure_of(of_kind, name)[1])
                     for kind, of_kind in wrong_by_kind.items()
@@ -103,7 +112,9 @@ def summarize(
             sensor: _outcomes([row for row in runs if row["sensor"] == sensor])
             for sensor in dict.fromkeys(row["sensor"] for row in runs)
         },
-        "judged": list(judged),
+        "accepted_wrong": [
+            row for row in judged if row["verdict"] == "accepted" and not row["right"]
+        ],
         "registered": list(runs),
     }
 
@@ -157,7 +168,7 @@ def table(report: Mapping[str, Any]) -> str:
     for outcome in outcomes:
         cells = "".join(f"{count[outcome]:>18}" for count in report["register"].values())
         lines.append(f"  {outcome.replace('_', ' '):<32}{cells}")
-    for row in (*report["judged"], *report["registered"]):
+    for row in (*report["accepted_wrong"], *report["registered"]):
         if row["verdict"] == "accepted" and not row["right"]:
             found = row.get("kind", "register")
             if found == OTHER_PART:
@@ -173,9 +184,10 @@ def picture(report: Mapping[str, Any]) -> Figure:
     figure = new_figure(11.0, 4.4)
     curves, bars = figure.subplots(1, 2)
     for color, name in zip(SERIES, report["figures"], strict=False):
-        right, wrong = figure_of(report["judged"], name)
-        label = f"{FIGURES[name]}: {report['figures'][name]['auc']:.3f}"
-        curves.step(*roc(right, wrong), where="post", color=color, label=label)
+        found = report["figures"][name]
+        label = f"{FIGURES[name]}: {found['auc']:.3f}"
+        false_accepts, true_accepts = found["curve"]
+        curves.plot(false_accepts, true_accepts, color=color, label=label)
     curves.plot([0, 1], [0, 1], ":", color=FAINT)
     curves.legend(
         loc="lower right", fontsize=8, labelcolor=INK, title="area under the curve",

@@ -234,14 +234,12 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     """The study."""
     judged, runs = measure(settings)
     method = "poses judged by ray casting"
-    summary = summarize(judged, runs)
     head = study.header(method, settings)
     # a thousand poses beside the figures that sum them up
-    study.save(settings.out, "judged", head | {"judged": summary["judged"]})
-    figures = {name: value for name, value in summary.items() if name != "judged"}
-    report = study.save(settings.out, "verdicts", head | figures)
-    save_figure(picture(summary), settings.out / "verdicts.png")
-    print(table(summary))
+    study.save(settings.out, "judged", head | {"judged": judged})
+    report = study.save(settings.out, "verdicts", head | summarize(judged, runs))
+    save_figure(picture(report), settings.out / "verdicts.png")
+    print(table(report))
     return report
 
 

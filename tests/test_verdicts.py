@@ -193,6 +193,9 @@ def test_what_is_reported() -> None:
     score = report["figures"]["score"]
     assert score["auc"] == pytest.approx(5 / 6)
     assert score["true_accepts_at_no_false"] == 0.5
+    # 0.9 and 0.6 against 0.7, 0.3 and 0.2: up, across, up, across
+    assert score["curve"] == [[0.0, 0.0, 0.3333, 0.3333, 1.0], [0.0, 0.5, 0.5, 1.0, 1.0]]
+    assert [row["kind"] for row in report["accepted_wrong"]] == [OTHER_PART]
     assert score["auc_by_kind"] == pytest.approx({"turned": 0.75, OTHER_PART: 1.0})
     # fewer violations are better, equal figures tell nothing
     assert report["figures"]["violation_share"]["auc"] == pytest.approx(5 / 6)

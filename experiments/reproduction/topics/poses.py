@@ -71,21 +71,19 @@ def _wrong_accepted(results: Results) -> Finding:
 
 
 def _verdict(results: Results, _: Live | None) -> list[Part]:
-    report = {"judged": [], **results["verdicts"]}
-    parts: list[Part] = [
+    report = results["verdicts"]
+    return [
         "Poses that a registration might end in, right and wrong, of many parts under virtual "
         "sensors, each judged as `register` judges its own. AUC: the chance that a right pose "
-        "scores above a wrong one."
+        "scores above a wrong one.",
+        Picture(
+            "ROC curves, and verdicts by kind of pose",
+            "Right against wrong poses by each figure alone; verdicts by kind of pose.",
+            draw=lambda: verdict_report.picture(report),
+        ),
+        text_block(verdict_report.table(report)),
+        origin(results, "verdicts"),
     ]
-    if report["judged"]:
-        parts.append(
-            Picture(
-                "ROC curves, and verdicts by kind of pose",
-                "Right against wrong poses by each figure alone; verdicts by kind of pose.",
-                draw=lambda: verdict_report.picture(report),
-            )
-        )
-    return [*parts, text_block(verdict_report.table(report)), origin(results, "verdicts")]
 
 
 def _any_rotation(results: Results) -> Finding:
