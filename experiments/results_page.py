@@ -17,6 +17,7 @@ from experiments import (
     ablation_table,
     comparison_table,
     density_report,
+    headline,
     public_vs_virtual,
     real_scans,
     robustness_report,
@@ -33,6 +34,7 @@ README, DETAILS = ROOT / "README.md", ROOT / "docs" / "comparison.md"
 ROBUSTNESS, REAL_SCANS = ROOT / "docs" / "robustness.md", ROOT / "docs" / "real_scans.md"
 PAGES = (README, DETAILS, ROBUSTNESS, REAL_SCANS)
 NAMES = (
+    *headline.NEEDS,
     "vane",
     "comparison",
     "tuning",
@@ -40,9 +42,7 @@ NAMES = (
     "density",
     "ablation_neighbors",
     "ablation_noise",
-    "robustness",
     "sensor_fit",
-    "real_scans",
     "sensor_transfer",
 )
 Report = Mapping[str, Any]
@@ -159,6 +159,7 @@ def blocks(results: Mapping[str, Report]) -> dict[Path, dict[str, str]]:
 
     return {
         README: {
+            "measured": headline.table(results),
             "vane": vane_table(results["vane"]),
             "table 1": brief_table(results["comparison"]),
             "public": public_vs_virtual.table(results["public_vs_virtual"]),
