@@ -169,8 +169,14 @@ def picture(report: Report) -> Figure:
             )
             _panel(axes, report, series, name)
     handles, labels = grid[-1, 0].get_legend_handles_labels()
+    room = max(1, 3 * len(shown) // 2)  # for so many of them in a row
     figure.legend(
-        handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=10
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=min(room, len(labels)),
+        frameon=False,
+        fontsize=10,
     )
     return figure
 

@@ -6,7 +6,6 @@ import functools
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from experiments import robustness, robustness_report
 from experiments.compare import NEED_DEG, NEED_MM
@@ -26,7 +25,6 @@ from experiments.robustness_report import networks, values, within_need
 
 PAPER_SERIES = ("distance", "angle", "light")
 ON_PAGE = 3  # series side by side: more are too small on paper
-LEAST_WIDTH_IN = 9.3  # of their picture, for its legend
 
 
 def _series(results: Results, name: str) -> Report:
@@ -128,15 +126,8 @@ def _series_picture(report: Report) -> Picture:
     return Picture(
         f"Errors, FFMDE and RMSE over {words}",
         f"Drawn as Fig. 11, each network alone (dashed) and refined (full): {words}.",
-        draw=lambda: _wide_enough(robustness_report.picture(report)),
+        draw=lambda: robustness_report.picture(report),
     )
-
-
-def _wide_enough(figure: Figure) -> Figure:
-    """A picture of few series, with room for the legend."""
-    width, height = figure.get_size_inches()
-    figure.set_size_inches(max(width, LEAST_WIDTH_IN), height)
-    return figure
 
 
 SENSING = Topic(
