@@ -126,6 +126,7 @@ LAYERS = [
     "plotting.matching",
     "plotting",
     "report.wording",
+    "report.templates",
     "report.pictures",
     "report.viewer",
     "report.view3d",

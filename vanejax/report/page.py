@@ -12,7 +12,6 @@ import platform
 import warnings
 from pathlib import Path
 
-import jinja2
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
@@ -31,6 +30,7 @@ from vanejax.plotting.deviation import (
 from vanejax.plotting.scene import Scene
 from vanejax.pose_result import Alternative, PointStatus, PoseResult, Uncertainty
 from vanejax.report.pictures import Image, color_bar, figure_uris, image
+from vanejax.report.templates import source, templates
 from vanejax.report.viewer import viewer
 from vanejax.report.wording import (
     degrees,
@@ -151,17 +151,10 @@ def write_report(
 
 def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransform | None) -> str:
     """The page's text."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("vanejax", "report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = templates()
     for words in (degrees, direction, fixed, millimetres, percent, significant):
         environment.filters[words.__name__] = words
-    loader = environment.loader
-    style, script = (loader.get_source(environment, name)[0] for name in ("page.css", "viewer.js"))
+    style, script = source("page.css"), source("viewer.js")
     scene = Scene(part)
     before, after = overlay_pictures(result, scan, part, scene=scene)
     moved = _difference(result.before, result.part_from_camera, part.center)

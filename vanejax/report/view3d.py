@@ -10,12 +10,10 @@ import base64
 import dataclasses
 import hashlib
 import html
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
 
-import jinja2
 import numpy as np
 from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation, Slerp
@@ -25,10 +23,11 @@ from vanejax.measured_scan import MeasuredScan
 from vanejax.part import Part
 from vanejax.plotting.canvas import REFERENCE_RED, SOURCE_GREEN
 from vanejax.plotting.clouds import seen_and_hidden
-from vanejax.plotting.deviation import NO_PARTNER, color_limit_mm
+from vanejax.plotting.deviation import color_limit_mm
 from vanejax.pose_result import PoseResult
 from vanejax.report.pictures import color_bar
-from vanejax.report.viewer import MAX_POINTS, columns, simplified, spacing_mm, to_base64, to_grid
+from vanejax.report.templates import source, templates
+from vanejax.report.viewer import MAX_POINTS, scene_json, simplified, spacing_mm
 from vanejax.report.viewer import viewer as viewer_of_result
 from vanejax.rigid_transform import RigidTransform
 from vanejax.scanner import Scan
@@ -230,55 +229,31 @@ def _scene(
     vertices, faces, _ = simplified(
         np.asarray(part.mesh.vertices, np.float64), np.asarray(part.mesh.faces)
     )
-    local_from_part = RigidTransform(np.eye(3), -part.center)
-    point_grid, points_from_grid = to_grid(points)
-    vertex_grid, part_from_grid = to_grid(vertices)
     # as far as any pose takes the cloud, and the part itself
     corners = [vertices, *(pose.apply(points[:: max(1, len(points) // 500)]) for pose in poses)]
     half = [np.abs((c - part.center) @ reader_from_part.T).max(axis=0) for c in corners]
-    scene = {
-        "radius": part.radius,
-        "half_mm": np.max(half, axis=0).tolist(),
-        "view": columns(RigidTransform(reader_from_part, np.zeros(3)).as_matrix()),
-        "mesh": {
-            "vertices": to_base64(vertex_grid, "<u2"),
-            "faces": to_base64(faces, "<u2"),
-            "model": columns(local_from_part.as_matrix() @ part_from_grid),
-        },
-        "scan": {
-            "points": to_base64(point_grid, "<u2"),
-            "deviation_um": to_base64(codes_um, "<i2"),
-            "spacing_mm": min(_DOT * spacing_mm(points), _LARGEST_DOT * part.radius),
-            "lift_mm": lift_mm,
-        },
-        "poses": [
-            {
-                "name": str(number),
-                "measured": True,
-                "model": columns((local_from_part @ pose).as_matrix() @ points_from_grid),
-            }
-            for number, pose in enumerate(poses)
-        ],
-        "limit_mm": _CODE_UM / 1000,
-        "colors": to_base64(np.round(255 * colors), "u1"),
-        "scan_color": to_rgb(SOURCE_GREEN),
-        "lost_color": to_rgb(NO_PARTNER),
-    }
-    # "<" could end the script element
-    return json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    names = [str(number) for number in range(len(poses))]
+    return scene_json(
+        part,
+        vertices,
+        faces,
+        points,
+        dict(zip(names, poses, strict=True)),
+        measured=names,
+        half_mm=np.max(half, axis=0),
+        codes_um=codes_um,
+        colors=colors,
+        limit_mm=_CODE_UM / 1000,
+        reader_from_part=reader_from_part,
+        spacing_mm=min(_DOT * spacing_mm(points), _LARGEST_DOT * part.radius),
+        lift_mm=lift_mm,
+    )
 
 
 def _view(scene: str, controls: _Controls) -> View3d:
     """The page around a scene."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("vanejax", "report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    names = ("page.css", "viewer.js", "film.js")
-    style, script, film = (environment.loader.get_source(environment, name)[0] for name in names)
+    environment = templates()
+    style, script, film = (source(name) for name in ("page.css", "viewer.js", "film.js"))
     scripts = [script, film] if controls.stops else [script]
     hashes = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts]
     page = environment.get_template("view3d.html").render(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from matplotlib import colormaps
@@ -66,23 +66,79 @@ def viewer(result: PoseResult, scan: MeasuredScan, part: Part) -> Viewer:
         some = np.sort(np.random.default_rng(0).choice(len(chosen), MAX_POINTS, replace=False))
         chosen, deviation = chosen[some], deviation[some]
     points = scan.points[chosen]
-    poses = [("Before", result.before), ("After", result.part_from_camera)]
-    poses += [
-        (f"Alternative {number}", alternative.part_from_camera)
+    poses = {"Before": result.before, "After": result.part_from_camera}
+    poses |= {
+        f"Alternative {number}": alternative.part_from_camera
         for number, alternative in enumerate(result.alternatives, 1)
-    ]
+    }
     vertices, faces, detail_mm = simplified(
         np.asarray(part.mesh.vertices, np.float64), np.asarray(part.mesh.faces)
     )
-    local_from_part = RigidTransform(np.eye(3), -part.center)
-    point_grid, camera_from_grid = to_grid(points)
-    vertex_grid, part_from_grid = to_grid(vertices)
     limit_mm = color_limit_mm(verification)
     reader_from_part = overlay_rotation(scan, part, result.part_from_camera)
-    half = np.abs((vertices - part.center) @ reader_from_part.T).max(axis=0)
+    json_text = scene_json(
+        part,
+        vertices,
+        faces,
+        points,
+        poses,
+        measured=("After",),
+        half_mm=np.abs((vertices - part.center) @ reader_from_part.T).max(axis=0),
+        codes_um=_micrometres(deviation),
+        colors=colormaps[DEVIATION_COLORMAP](np.linspace(0, 1, 256)),
+        limit_mm=limit_mm,
+        reader_from_part=reader_from_part,
+        spacing_mm=spacing_mm(points),
+        # little enough to hide behind the thinnest wall
+        lift_mm=min(limit_mm, 0.005 * part.radius),
+    )
+    return Viewer(
+        json=json_text,
+        poses=tuple(poses),
+        num_points=len(points),
+        num_faces=len(faces),
+        detail_mm=detail_mm,
+    )
+
+
+def scene_json(
+    part: Part,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    points: np.ndarray,
+    poses: Mapping[str, RigidTransform],
+    *,
+    measured: Collection[str],
+    half_mm: np.ndarray,
+    codes_um: np.ndarray,
+    colors: np.ndarray,
+    limit_mm: float,
+    reader_from_part: np.ndarray,
+    spacing_mm: float,
+    lift_mm: float,
+) -> str:
+    """What `viewer.js` reads.
+
+    Args:
+      part: about whose centre the view turns.
+      vertices, faces: of its surface as shown, [V, 3] mm and [F, 3], V at most `MAX_VERTICES`.
+      points: [N, 3] mm.
+      poses: part_from_points by name, in the order of the buttons.
+      measured: names of the poses that the points' codes are for.
+      half_mm: [3], how far the scene reaches from the centre, as the reader sees it.
+      codes_um: [N], deviations in whole micrometres; -32768 for none.
+      colors: [256, 4], 0 to 1, from -``limit_mm`` to ``limit_mm``.
+      limit_mm: deviation at the ends of the colours.
+      reader_from_part: [3, 3], rows right, up, towards the reader.
+      spacing_mm: how large dots are drawn.
+      lift_mm: how far in front of the surface dots are drawn, at least.
+    """
+    local_from_part = RigidTransform(np.eye(3), -part.center)
+    point_grid, points_from_grid = to_grid(points)
+    vertex_grid, part_from_grid = to_grid(vertices)
     scene = {
         "radius": part.radius,
-        "half_mm": half.tolist(),
+        "half_mm": np.asarray(half_mm).tolist(),
         "view": columns(RigidTransform(reader_from_part, np.zeros(3)).as_matrix()),
         "mesh": {
             "vertices": to_base64(vertex_grid, "<u2"),
@@ -91,34 +147,25 @@ def viewer(result: PoseResult, scan: MeasuredScan, part: Part) -> Viewer:
         },
         "scan": {
             "points": to_base64(point_grid, "<u2"),
-            "deviation_um": to_base64(_micrometres(deviation), "<i2"),
-            "spacing_mm": spacing_mm(points),
-            # little enough to hide behind the thinnest wall
-            "lift_mm": min(limit_mm, 0.005 * part.radius),
+            "deviation_um": to_base64(codes_um, "<i2"),
+            "spacing_mm": spacing_mm,
+            "lift_mm": lift_mm,
         },
         "poses": [
             {
                 "name": name,
-                "measured": name == "After",
-                "model": columns((local_from_part @ pose).as_matrix() @ camera_from_grid),
+                "measured": name in measured,
+                "model": columns((local_from_part @ pose).as_matrix() @ points_from_grid),
             }
-            for name, pose in poses
+            for name, pose in poses.items()
         ],
         "limit_mm": limit_mm,
-        "colors": to_base64(
-            np.round(255 * colormaps[DEVIATION_COLORMAP](np.linspace(0, 1, 256))), "u1"
-        ),
+        "colors": to_base64(np.round(255 * colors), "u1"),
         "scan_color": to_rgb(SOURCE_GREEN),
         "lost_color": to_rgb(NO_PARTNER),
     }
-    return Viewer(
-        # "<" could end the script element
-        json=json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
-        poses=tuple(name for name, _ in poses),
-        num_points=len(points),
-        num_faces=len(faces),
-        detail_mm=detail_mm,
-    )
+    # "<" could end the script element
+    return json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
 def simplified(
