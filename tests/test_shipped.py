@@ -62,7 +62,7 @@ def test_it_knows_the_part_in_other_files(matcher: TrainedMatcher, part: Part) -
         assert matcher.knows(again)
 
 
-@pytest.mark.parametrize("change", ["scaled", "moved", "mirrored", "half"])
+@pytest.mark.parametrize("change", ["scaled", "moved", "mirrored", "filled", "more"])
 def test_it_knows_no_other_part(matcher: TrainedMatcher, part: Part, change: str) -> None:
     mesh = part.mesh.copy()
     if change == "scaled":
@@ -72,9 +72,16 @@ def test_it_knows_no_other_part(matcher: TrainedMatcher, part: Part, change: str
     elif change == "mirrored":
         mesh.apply_transform(np.diag([1.0, -1.0, 1.0, 1.0]))
         mesh.apply_translation([0.0, 2 * part.center[1], 0.0])
-    else:  # bounds stay, a stretch of the inside is filled
+    elif change == "filled":
         mesh = mesh.convex_hull
+    else:  # every point of the vane is there, and a block in the empty corner of its box besides
+        middle = part.center + np.array([48.0, -18.0, -15.0])
+        block = trimesh.creation.box(bounds=[middle - 5.0, middle + 5.0])
+        mesh = trimesh.util.concatenate([mesh, block])
     other = part_of(mesh, change)
+    if change == "more":
+        assert (other.center == part.center).all()
+        assert other.radius == part.radius
     assert not matcher.knows(other)
     assert shipped_weights(other) is None
     with pytest.raises(InputError, match=f"no weights are shipped for {change}"):
