@@ -55,10 +55,16 @@ def recorded() -> dict[str, Report]:
 
 def made_by(report: Report) -> str:
     """Machine, date and commit of a result, in a line."""
-    machine = report.get("machine", {})
-    cpu = machine.get("cpu") or machine.get("processor") or "an unknown processor"
-    commit = (report["commit"] or "unknown")[:10]
-    return f"{cpu}, {machine.get('cores')} cores; {report['date'][:10]}, commit {commit}."
+    commit = str(report["commit"] or "unknown")[:10]
+    return f"{measured_on(report)}; {report['date'][:10]}, commit {commit}."
+
+
+def measured_on(report: Report) -> str:
+    """The machine of a result, as far as it says."""
+    told = report.get("machine", {})
+    name = told.get("cpu") or told.get("processor") or report.get("device") or "unknown"
+    cores = told.get("cores")
+    return f"{name}, {cores} core{'s' if cores != 1 else ''}" if cores else str(name)
 
 
 def vane_table(report: Report) -> str:

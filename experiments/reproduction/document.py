@@ -11,7 +11,8 @@ from experiments.reproduction.contents import OF_OURS, OF_PAPER, Section, sectio
 from experiments.reproduction.live import Live
 from experiments.reproduction.markdown import table
 from experiments.reproduction.studies import BY_RECORD, Outcome
-from experiments.reproduction.topic import Picture, machine
+from experiments.reproduction.topic import Picture
+from experiments.results_page import measured_on
 
 TITLE = "The paper, measured again"
 PAPER = (
@@ -122,7 +123,7 @@ def _provenance(results: Results) -> str:
                 f"`{name}.json`",
                 str(report["date"])[:10],
                 f"`{str(report['commit'] or 'unknown')[:11]}`",
-                machine(report),
+                measured_on(report),
                 ", ".join(map(str, seed)) if isinstance(seed, list) else str(seed),
                 f"`{BY_RECORD[name].command()}`",
             ]

@@ -8,11 +8,11 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from experiments.reproduction.claim import Claim, Report, Results
+from experiments.reproduction.claim import Claim, Results
 from experiments.reproduction.live import Live
 from experiments.reproduction.markdown import slug
 from experiments.reproduction.studies import BY_RECORD
-from experiments.results_page import text_block
+from experiments.results_page import made_by, text_block
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -91,14 +91,4 @@ def missing(name: str) -> str:
 
 def origin(results: Results, name: str) -> str:
     """Which record, from where."""
-    report = results[name]
-    commit = str(report["commit"] or "unknown")[:10]
-    return f"Record `{name}.json`: {machine(report)}; {report['date'][:10]}, commit {commit}."
-
-
-def machine(report: Report) -> str:
-    """What a record was measured on, as far as it says."""
-    told = report.get("machine", {})
-    name = told.get("cpu") or told.get("processor") or report.get("device") or "unknown"
-    cores = told.get("cores")
-    return f"{name}, {cores} core{'s' if cores != 1 else ''}" if cores else str(name)
+    return f"Record `{name}.json`: {made_by(results[name])}"
