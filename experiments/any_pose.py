@@ -24,8 +24,9 @@ from experiments import study
 from experiments.vane_views import VaneViews, magnitudes, pose_error, with_noise
 from vanejax.locate import register
 from vanejax.measured_scan import MeasuredScan
-from vanejax.model_file import TrainedMatcher, load_model
+from vanejax.model_file import TrainedMatcher
 from vanejax.rigid import RigidTransform
+from vanejax.shipped import find_weights
 
 RIGHT_DEG, RIGHT_MM = 0.1, 0.1
 LEAST_RIGHT, MOST_SECONDS = 0.98, 10.0
@@ -131,8 +132,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     views = VaneViews()
     weights = None
     if settings.weights != "none":
-        weights = load_model(settings.weights)
-        weights.check_part(views.part)
+        weights = find_weights(settings.weights, views.part)
     if weights is not None:  # compiles
         attempt(views, 0, weights, noise_mm=settings.noise_mm, seed=settings.seed)
     rows = [
@@ -152,7 +152,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--weights",
         default="none",
-        help="from `vanejax export`, for the guide vane; none (default)",
+        help="from `vanejax export`, for the guide vane; shipped; none (default)",
     )
     parser.add_argument("--count", type=study.count, default=200, help="random rotations (200)")
     parser.add_argument("--noise-mm", type=float, default=0.1, help="along the rays (0.1)")

@@ -64,8 +64,6 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
         weights=settings.weights,
         large=settings.large,
     )
-    if bench.matcher is not None:
-        bench.matcher.check_part(bench.views.part)
     report = study.header("times, warm", settings, bench.views.part)
     report["machine"] |= {
         "cpu": machine.cpu_model(),
@@ -108,7 +106,9 @@ def make_parser() -> argparse.ArgumentParser:
     """The command's arguments."""
     parser = study.make_parser("benchmark", __doc__)
     parser.add_argument("--only", help=f"some of {','.join(BENCHMARKS)}")
-    parser.add_argument("--weights", type=Path, help="from `vanejax export`, for the guide vane")
+    parser.add_argument(
+        "--weights", type=Path, help="from `vanejax export`, for the guide vane; or shipped"
+    )
     parser.add_argument("--repeats", type=study.count, default=LEAST_REPEATS)
     parser.add_argument(
         "--large", action="store_true", help="scaling: up to 10 M faces and points, for minutes"

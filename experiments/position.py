@@ -18,7 +18,6 @@ import argparse
 import dataclasses
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,7 @@ from experiments.vane_views import VaneViews, magnitudes, pose_error
 from vanejax.calibration import Calibration
 from vanejax.errors import InputError
 from vanejax.locate import register
-from vanejax.model_file import TrainedMatcher, load_model
+from vanejax.model_file import TrainedMatcher
 from vanejax.plotting.canvas import save_figure
 from vanejax.positioning import (
     angle_sigma_deg,
@@ -46,6 +45,7 @@ from vanejax.positioning import (
 )
 from vanejax.rigid_transform import RigidTransform
 from vanejax.sensor import Sensor, preset
+from vanejax.shipped import find_weights
 
 SENSOR = "paper_camera"
 VIEWS = "108,115,122,129,136"  # all 75 deg high
@@ -322,8 +322,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     stand.moves(settings.positions)
     weights = None
     if settings.weights is not None:
-        weights = load_model(settings.weights)
-        weights.check_part(views.part)
+        weights = find_weights(settings.weights, views.part)
     method = "ray casting" if weights is None else "RPM-Net, then ray casting"
     report = study.header(method, settings, views.part) | {
         "sensor": SENSOR,
@@ -356,7 +355,7 @@ def make_parser() -> argparse.ArgumentParser:
         help="of the stage, turned and moved, the initial one included (12, which is the most)",
     )
     parser.add_argument(
-        "--weights", type=Path, metavar="FILE", help="of RPM-Net, from `vanejax export` (none)"
+        "--weights", metavar="FILE", help="of RPM-Net, from `vanejax export`; or shipped (none)"
     )
     return parser
 

@@ -32,7 +32,7 @@ from vanejax.locate import register
 from vanejax.matched_poses import match_poses
 from vanejax.measured_scan import MeasuredScan
 from vanejax.measurement import measure
-from vanejax.model_file import TrainedMatcher, load_model
+from vanejax.model_file import TrainedMatcher
 from vanejax.part import Part
 from vanejax.plotting.canvas import save_figure
 from vanejax.pointcloud import voxel_thin
@@ -42,6 +42,7 @@ from vanejax.rigid_transform import RigidTransform
 from vanejax.scan_stream import RandomViews
 from vanejax.scanner import Scanner
 from vanejax.sensor import preset
+from vanejax.shipped import find_weights
 from vanejax.surface import Surface
 from vanejax.vane import guide_vane
 
@@ -213,10 +214,8 @@ def parse_weights(words: Sequence[str]) -> dict[str, Path]:
 def main(settings: argparse.Namespace) -> dict[str, Any]:
     """All series, then the random scans."""
     files = parse_weights(settings.weights)
-    networks = {name: load_model(path) for name, path in files.items()}
     part = guide_vane()
-    for matcher in networks.values():
-        matcher.check_part(part)
+    networks = {name: find_weights(path, part) for name, path in files.items()}
     trial = Trial(part, networks)
     series = make_series(part, views=settings.views, seed=settings.seed, sensor=SENSOR)
     report = study.header("RPM-Net, then ray casting", settings, part) | {

@@ -14,8 +14,9 @@ import numpy as np
 from experiments import study
 from experiments.vane_views import VaneViews, beside, magnitudes, pose_error, with_noise
 from vanejax.measured_scan import MeasuredScan
-from vanejax.model_file import TrainedMatcher, load_model
+from vanejax.model_file import TrainedMatcher
 from vanejax.rigid import RigidTransform
+from vanejax.shipped import find_weights
 
 NOISE_MM, START_DEG, START_MM = 0.1, 5.0, 5.0
 LONG_S = 10.0  # from here on cold caches hardly count
@@ -91,7 +92,7 @@ class Bench:
     @functools.cached_property
     def matcher(self) -> TrainedMatcher | None:
         """The weights, read."""
-        return None if self.weights is None else load_model(self.weights)
+        return None if self.weights is None else find_weights(self.weights, self.views.part)
 
     def time(self, function: Callable[[], Any]) -> tuple[list[float], Any]:
         """Seconds of each repeat after a first one that does not count, and what was returned."""

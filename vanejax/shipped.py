@@ -29,7 +29,7 @@ def find_weights(named: str | os.PathLike[str], part: Part) -> TrainedMatcher:
     Raises:
       InputError: the file cannot be read, or no network of this part is there.
     """
-    if named != WORD:
+    if os.fspath(named) != WORD:
         matcher = load_model(named)
         matcher.check_part(part)
         return matcher
