@@ -28,21 +28,29 @@ from typing import Any
 import jax
 from absl import flags
 
-from experiments import ablation_picture, command_line, study
-from experiments.ablation_table import CELL_TESTS, over_seeds, table
 from experiments.evaluate import registered, report_of
-from experiments.experiment import Experiment
-from experiments.machine import cores, cpu_model
-from experiments.report import plain
-from experiments.run_folder import RunFolder, git_commit, training_record, versions, write_text
-from experiments.sweep import Cell, Sweep, grid, parse_seeds, parse_sweeps
+from experiments.runner import command_line
+from experiments.runner import study_command as study
+from experiments.runner.evaluation_report import plain
+from experiments.runner.experiment import Experiment
+from experiments.runner.machine import cores, cpu_model
+from experiments.runner.run_folder import (
+    RunFolder,
+    git_commit,
+    training_record,
+    versions,
+    write_text,
+)
+from experiments.runner.sweep import Cell, Sweep, grid, parse_seeds, parse_sweeps
+from experiments.runner.trained import trained
+from experiments.studies.ablation import picture as ablation_picture
+from experiments.studies.ablation.table import CELL_TESTS, over_seeds, table
 from experiments.train import Interrupted, TrainingDiverged, load_or_scan
-from experiments.trained import trained
-from vanejax.dataset import ScanSet, describe_source
+from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.part import Part
 from vanejax.plotting.canvas import save_figure
-from vanejax.training import Variables
+from vanejax.training.dataset import ScanSet, describe_source
+from vanejax.training.train_step import Variables
 
 MEASURES = (
     "rotation_error_deg",

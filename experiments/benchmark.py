@@ -22,16 +22,17 @@ from typing import Any
 
 import numpy as np
 
-from experiments import machine, study
 from experiments.benchmarks.compilation import compilation
 from experiments.benchmarks.evaluation import evaluation
 from experiments.benchmarks.network import inference, step
 from experiments.benchmarks.processes import command, start
 from experiments.benchmarks.registration import refine_against_casts, register_from
 from experiments.benchmarks.scaling import scaling
+from experiments.benchmarks.scaling_series import Series, growth_table, summarize_growth
 from experiments.benchmarks.scanning import scan
-from experiments.growth import Series, growth_table, summarize_growth
-from experiments.timing import Bench, Figure, summarize, table
+from experiments.benchmarks.timing import Bench, Figure, summarize, table
+from experiments.runner import machine
+from experiments.runner import study_command as study
 from vanejax.errors import InputError
 
 LEAST_REPEATS = 5

@@ -22,21 +22,23 @@ import jax
 import numpy as np
 from absl import flags
 
-from experiments import command_line, comparison_pictures, study
-from experiments.comparison import NETWORKS, Comparison
-from experiments.comparison_table import table
-from experiments.fine_step import FineStep
-from experiments.machine import cores, cpu_model, peer_versions
-from experiments.methods import TABLE_1, TITLES, make_method, settings_of
-from experiments.registrations import Results, register_views
-from experiments.report import hardest_views, summarize
-from experiments.run_folder import git_commit, versions
+from experiments.runner import command_line
+from experiments.runner import study_command as study
+from experiments.runner.evaluation_report import hardest_views, summarize
+from experiments.runner.machine import cores, cpu_model, peer_versions
+from experiments.runner.registrations import Results, register_views
+from experiments.runner.run_folder import git_commit, versions
+from experiments.runner.trained import Trained, given_runs, trained
+from experiments.studies.comparison import pictures as comparison_pictures
+from experiments.studies.comparison.fine_step import FineStep
+from experiments.studies.comparison.methods import TABLE_1, TITLES, make_method, settings_of
+from experiments.studies.comparison.settings import NETWORKS, Comparison
+from experiments.studies.comparison.table import table
 from experiments.train import exit_code, load_or_scan
-from experiments.trained import Trained, given_runs, trained
-from vanejax.dataset import ScanSet
 from vanejax.errors import InputError, MissingExtra
-from vanejax.metrics import summary
-from vanejax.pairs import make_bank
+from vanejax.matching.metrics import summary
+from vanejax.training.dataset import ScanSet
+from vanejax.training.pairs import make_bank
 
 NEED_DEG, NEED_MM = 0.5, 1.0  # what the paper's machining process asks for
 

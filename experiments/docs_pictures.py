@@ -8,29 +8,29 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments import study
+from experiments.runner import study_command as study
 from vanejax import plotting
-from vanejax.camera import Camera, Viewpoints, hemisphere_viewpoints
-from vanejax.casting import Casting, as_cast
-from vanejax.dataset import make_scan_set
-from vanejax.locate import register
-from vanejax.measured_scan import MeasuredScan, clean_scan
-from vanejax.measurement import measure
-from vanejax.model_file import TrainedMatcher
-from vanejax.pairs import draw_pairs, make_bank
-from vanejax.part import Part
+from vanejax.cad.investment_casting import Casting, as_cast
+from vanejax.cad.parametric_vane import guide_vane
+from vanejax.cad.part import Part
+from vanejax.localization.pose_result import PoseResult
+from vanejax.localization.registration import register
 from vanejax.plotting.canvas import FAINT, INK, REFERENCE_RED, SOURCE_GREEN, new_figure, style_chart
 from vanejax.plotting.casting import casting_map
 from vanejax.plotting.matching import Matching, matching_lines
 from vanejax.plotting.segments import segments_picture
-from vanejax.pose_result import PoseResult
 from vanejax.rigid import RigidTransform
-from vanejax.scanner import Scanner
-from vanejax.scene import Clutter, clutter_scene
-from vanejax.segmentation import segment
-from vanejax.sensor import preset
-from vanejax.shipped import find_weights
-from vanejax.vane import guide_vane
+from vanejax.scanner.camera import Camera, Viewpoints, hemisphere_viewpoints
+from vanejax.scanner.clutter import Clutter, clutter_scene
+from vanejax.scanner.measurement import measure
+from vanejax.scanner.sensor import preset
+from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scans.measured_scan import MeasuredScan, clean_scan
+from vanejax.scans.segmentation import segment
+from vanejax.training.dataset import make_scan_set
+from vanejax.training.pairs import draw_pairs, make_bank
+from vanejax.training.pretrained import find_weights
+from vanejax.training.weight_file import TrainedMatcher
 
 VIEW = 20  # of the 216: elevation 60, azimuth 200 deg, a test view
 SHOWN = (0, 20, 85)  # views whose shadow is drawn

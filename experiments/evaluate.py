@@ -20,24 +20,25 @@ from typing import Any
 import jax
 from absl import flags
 
-from experiments import command_line, pictures
-from experiments.experiment import Experiment
-from experiments.registrations import Results, register_views
-from experiments.report import hardest_views, plain, summarize, table
-from experiments.run_folder import (
+from experiments.runner import command_line
+from experiments.runner import evaluation_pictures as pictures
+from experiments.runner.evaluation_report import hardest_views, plain, summarize, table
+from experiments.runner.experiment import Experiment
+from experiments.runner.registrations import Results, register_views
+from experiments.runner.run_folder import (
     RunFolder,
     git_commit,
     training_record,
     versions,
     write_json,
 )
-from experiments.training_record import TrainingRecord
-from vanejax.checkpoint import Checkpoints
-from vanejax.dataset import ScanSet, describe_source, load_scan_set
+from experiments.runner.training_record import TrainingRecord
+from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.pairs import make_bank
-from vanejax.part import Part
-from vanejax.training import Variables, init_state
+from vanejax.training.checkpoint import Checkpoints
+from vanejax.training.dataset import ScanSet, describe_source, load_scan_set
+from vanejax.training.pairs import make_bank
+from vanejax.training.train_step import Variables, init_state
 
 
 def evaluate(

@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.marked_page import with_block
-from experiments.timing import shown
-from vanejax.whole_file import write_text
+from experiments.benchmarks.timing import shown
+from experiments.pages.marked_page import with_block
+from vanejax.files import write_text
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "performance.md"

@@ -19,16 +19,16 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from experiments import study
-from experiments.reproduction.document import Document, document, to_markdown
-from experiments.reproduction.live import Live, evaluate_live, measure_position
-from experiments.reproduction.page import to_page
-from experiments.reproduction.run import estimate, measured, outcomes_json, run_studies
-from experiments.reproduction.studies import ROOT, Outcome, chosen, recorded
+from experiments.pages.reproduction.document import Document, document, to_markdown
+from experiments.pages.reproduction.live import Live, evaluate_live, measure_position
+from experiments.pages.reproduction.page import to_page
+from experiments.pages.reproduction.run import estimate, measured, outcomes_json, run_studies
+from experiments.pages.reproduction.studies import ROOT, Outcome, chosen, recorded
+from experiments.runner import study_command as study
+from vanejax.cad.parametric_vane import guide_vane
 from vanejax.errors import InputError
-from vanejax.shipped import WORD, find_weights
-from vanejax.vane import guide_vane
-from vanejax.whole_file import check_writable, write_text
+from vanejax.files import check_writable, write_text
+from vanejax.training.pretrained import WORD, find_weights
 
 DOCS = ROOT / "docs"
 PAGE = DOCS / "results.md"

@@ -13,20 +13,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments import (
-    ablation_table,
-    comparison_table,
-    density_report,
-    headline,
-    public_vs_virtual,
-    real_scans,
-    robustness_report,
-    sensor_fit,
-    sensor_transfer,
-)
-from experiments.marked_page import with_block
-from experiments.methods import TITLES
-from vanejax.whole_file import write_text
+from experiments.pages import summary_table as headline
+from experiments.pages.marked_page import with_block
+from experiments.studies.ablation import table as ablation_table
+from experiments.studies.comparison import table as comparison_table
+from experiments.studies.comparison.methods import TITLES
+from experiments.studies.density import report as density_report
+from experiments.studies.public_vs_virtual import study as public_vs_virtual
+from experiments.studies.real_scans import study as real_scans
+from experiments.studies.robustness import report as robustness_report
+from experiments.studies.sensor_fit import study as sensor_fit
+from experiments.studies.sensor_transfer import study as sensor_transfer
+from vanejax.files import write_text
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "experiments" / "results"

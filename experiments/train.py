@@ -22,24 +22,18 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from experiments import command_line
 from experiments.evaluate import evaluate
-from experiments.experiment import Experiment, TrainingSettings
-from experiments.run_folder import RunFolder, training_record
-from experiments.training_banks import training_banks
-from vanejax.checkpoint import Checkpoints, all_finite, restore_or
-from vanejax.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
-from vanejax.metrics import pose_metrics
-from vanejax.pairs import Bank, Drawing
-from vanejax.part import Part
+from experiments.runner import command_line
+from experiments.runner.experiment import Experiment, TrainingSettings
+from experiments.runner.run_folder import RunFolder, training_record
+from experiments.runner.training_banks import training_banks
+from vanejax.cad.part import Part
+from vanejax.matching.metrics import pose_metrics
 from vanejax.rigid import RigidTransform
-from vanejax.training import (
-    Metrics,
-    TrainState,
-    Variables,
-    init_state,
-    make_train_step,
-)
+from vanejax.training.checkpoint import Checkpoints, all_finite, restore_or
+from vanejax.training.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
+from vanejax.training.pairs import Bank, Drawing
+from vanejax.training.train_step import Metrics, TrainState, Variables, init_state, make_train_step
 
 DIVERGED = 20.0  # times the loss of the first rows: no run of use comes back from there
 

@@ -25,15 +25,16 @@ import numpy as np
 from absl import flags
 from tqdm import tqdm
 
-from experiments import command_line, study
-from experiments.comparison import CLASSICAL, OPEN3D, Comparison
-from experiments.machine import cores, cpu_model, peer_versions
-from experiments.methods import TITLES, make_method
-from experiments.registrations import Results, register_views
-from experiments.run_folder import git_commit, versions
+from experiments.runner import command_line
+from experiments.runner import study_command as study
+from experiments.runner.machine import cores, cpu_model, peer_versions
+from experiments.runner.registrations import Results, register_views
+from experiments.runner.run_folder import git_commit, versions
+from experiments.studies.comparison.methods import TITLES, make_method
+from experiments.studies.comparison.settings import CLASSICAL, OPEN3D, Comparison
 from experiments.train import load_or_scan
 from vanejax.errors import InputError, MissingExtra
-from vanejax.pairs import make_bank
+from vanejax.training.pairs import make_bank
 
 CAP_DEG = 20.0
 _FEATURES = (0.25, 0.3, 0.5)

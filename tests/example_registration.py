@@ -8,10 +8,9 @@ import functools
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vanejax.camera import Camera, hemisphere_viewpoints
-from vanejax.measured_scan import MeasuredScan
-from vanejax.part import Part
-from vanejax.pose_result import (
+from vanejax.cad.parametric_vane import guide_vane
+from vanejax.cad.part import Part
+from vanejax.localization.pose_result import (
     Alternative,
     PointStatus,
     PoseResult,
@@ -21,8 +20,9 @@ from vanejax.pose_result import (
     Verification,
 )
 from vanejax.rigid import RigidTransform
-from vanejax.scanner import Scanner
-from vanejax.vane import guide_vane
+from vanejax.scanner.camera import Camera, hemisphere_viewpoints
+from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scans.measured_scan import MeasuredScan
 
 NOISE_MM = 0.1
 TOLERANCE_MM = 0.4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vanejax.pose_result import (
+from vanejax.localization.pose_result import (
     Alternative,
     PointStatus,
     PoseResult,

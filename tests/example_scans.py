@@ -8,13 +8,13 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from vanejax.camera import Camera, hemisphere_viewpoints
-from vanejax.part import Part, part_from_mesh
-from vanejax.residuals import RayCasting
+from vanejax.cad.parametric_vane import guide_vane
+from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cad.surface import Surface
+from vanejax.localization.residuals import RayCasting
 from vanejax.rigid import RigidTransform
-from vanejax.scanner import Scan, Scanner
-from vanejax.surface import Surface
-from vanejax.vane import guide_vane
+from vanejax.scanner.camera import Camera, hemisphere_viewpoints
+from vanejax.scanner.virtual_scanner import Scan, Scanner
 
 SMALL = Camera(width=160, height=128)  # sees the vane with 2,300 points
 MIDDLE = Camera(width=400, height=320)  # with 14,000

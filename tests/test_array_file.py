@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vanejax.array_file import array_header, read_stored_arrays
+from vanejax.files import array_header, read_stored_arrays
 
 
 def header_of(text: bytes, version: bytes = b"\x01\x00") -> bytes:

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from vanejax.matching.se3 import exp_se3
 from vanejax.pointcloud import PointCloud, ball_query, squared_distances, voxel_thin
-from vanejax.rigid import RigidTransform, exp_se3
+from vanejax.rigid import RigidTransform
 
 query = jax.jit(ball_query, static_argnames=("radius", "num_neighbors"))
 

@@ -12,18 +12,9 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
-from vanejax.rigid import (
-    RigidTransform,
-    exp_se3,
-    exp_so3,
-    hat,
-    log_se3,
-    log_so3,
-    nearest_rotation,
-    rotation_angle,
-    vee,
-    weighted_procrustes,
-)
+from vanejax.matching.procrustes import nearest_rotation, weighted_procrustes
+from vanejax.matching.se3 import exp_se3, exp_so3, hat, log_se3, log_so3, rotation_angle, vee
+from vanejax.rigid import RigidTransform
 
 BATCHES = [(), (1,), (3, 1, 2)]
 ROUNDING = 1e-12  # f64 eps x coordinates up to 100 x a dozen operations

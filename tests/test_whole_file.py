@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from vanejax.errors import InputError
-from vanejax.whole_file import check_writable, whole_file, write_text
+from vanejax.files import check_writable, whole_file, write_text
 
 
 def write_half(path: Path, error: BaseException) -> None:

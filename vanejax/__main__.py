@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from vanejax.cli import main
+from vanejax.cli.program import main
 
 if __name__ == "__main__":
     sys.exit(main())

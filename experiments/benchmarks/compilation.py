@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from experiments.benchmarks.processes import output
-from experiments.timing import Bench, Figure
-from experiments.vane_pairs import VanePairs
+from experiments.benchmarks.timing import Bench, Figure
+from experiments.benchmarks.vane_pairs import VanePairs
 from vanejax import compilation_cache
 
 NEAR_ZERO_S = 1.0

@@ -16,17 +16,18 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from experiments import evaluate, pictures
+from experiments import evaluate
+from experiments.benchmarks.flops import feature_flops, inference_flops
 from experiments.benchmarks.network import arithmetic
 from experiments.benchmarks.processes import output
+from experiments.benchmarks.timing import Bench, Figure
 from experiments.configs.vane import get_config
-from experiments.flops import feature_flops, inference_flops
-from experiments.report import hardest_views, table
-from experiments.timing import Bench, Figure
+from experiments.runner import evaluation_pictures as pictures
+from experiments.runner.evaluation_report import hardest_views, table
 from vanejax import compilation_cache
-from vanejax.dataset import ScanSet, load_scan_set, make_scan_set
-from vanejax.pairs import make_bank
-from vanejax.training import init_state
+from vanejax.training.dataset import ScanSet, load_scan_set, make_scan_set
+from vanejax.training.pairs import make_bank
+from vanejax.training.train_step import init_state
 
 
 def evaluation(bench: Bench) -> Iterator[Figure]:

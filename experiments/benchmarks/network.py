@@ -8,14 +8,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments import machine
-from experiments.flops import inference_flops, step_flops
-from experiments.timing import Bench, Figure
-from experiments.vane_pairs import VanePairs
-from vanejax.models.rpmnet import last_match
-from vanejax.pairs import Pair
+from experiments.benchmarks.flops import inference_flops, step_flops
+from experiments.benchmarks.timing import Bench, Figure
+from experiments.benchmarks.vane_pairs import VanePairs
+from experiments.runner import machine
+from vanejax.matching.rpmnet import last_match
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
+from vanejax.training.pairs import Pair
 
 TEST_ITERATIONS = 5
 
@@ -121,7 +121,7 @@ def torch_step(bench: Bench, pairs: VanePairs) -> Figure:
     try:
         import torch
 
-        from experiments import torch_rpmnet
+        from experiments.benchmarks import torch_rpmnet
     except ImportError as error:
         return Figure(name, [], note=f"skipped: {error}")
 
@@ -141,7 +141,7 @@ def torch_inference(bench: Bench, pairs: VanePairs) -> Figure:
     try:
         import torch
 
-        from experiments import torch_rpmnet
+        from experiments.benchmarks import torch_rpmnet
     except ImportError as error:
         return Figure(name, [], note=f"skipped: {error}")
 

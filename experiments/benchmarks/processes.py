@@ -10,11 +10,11 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from experiments.run_folder import write_json
-from experiments.timing import Bench, Figure
+from experiments.benchmarks.timing import Bench, Figure
+from experiments.runner.run_folder import write_json
 from vanejax.errors import InputError
-from vanejax.pose_file import pose_to_dict
-from vanejax.scan_file import save_points
+from vanejax.machine.pose_file import pose_to_dict
+from vanejax.scans.scan_file import save_points
 
 
 def start(bench: Bench) -> Iterator[Figure]:

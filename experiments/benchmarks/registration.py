@@ -10,12 +10,12 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from experiments.other_icp import OPEN3D_ICP, SMALL_GICP, open3d_icp, small_gicp_icp
-from experiments.timing import Bench, Figure
-from vanejax.locate import register
-from vanejax.part import Part
-from vanejax.refine import refine
-from vanejax.residuals import Precision, RayCasting, Residuals
+from experiments.benchmarks.other_icp import OPEN3D_ICP, SMALL_GICP, open3d_icp, small_gicp_icp
+from experiments.benchmarks.timing import Bench, Figure
+from vanejax.cad.part import Part
+from vanejax.localization.fine_registration import refine
+from vanejax.localization.registration import register
+from vanejax.localization.residuals import Precision, RayCasting, Residuals
 from vanejax.rigid import RigidTransform
 
 

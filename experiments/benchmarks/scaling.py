@@ -14,16 +14,16 @@ import numpy as np
 import trimesh
 
 from experiments.benchmarks.network import registering, training
-from experiments.growth import Series
-from experiments.timing import NOISE_MM, Bench
-from experiments.vane_pairs import VanePairs
-from experiments.vane_views import VaneViews, with_noise
-from vanejax.locate import register
-from vanejax.measured_scan import MeasuredScan
-from vanejax.part import Part, load_part
-from vanejax.refine import refine
-from vanejax.scan_file import load_scan, save_points
-from vanejax.scanner import Scanner
+from experiments.benchmarks.scaling_series import Series
+from experiments.benchmarks.timing import NOISE_MM, Bench
+from experiments.benchmarks.vane_pairs import VanePairs
+from experiments.runner.vane_views import VaneViews, with_noise
+from vanejax.cad.part import Part, load_part
+from vanejax.localization.fine_registration import refine
+from vanejax.localization.registration import register
+from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scans.measured_scan import MeasuredScan
+from vanejax.scans.scan_file import load_scan, save_points
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,13 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from embreex.rtcore_scene import EmbreeScene
 
-from experiments import machine
 from experiments.benchmarks.registration import bare_scene
-from experiments.timing import Bench, Figure
-from vanejax.camera import Camera
-from vanejax.part import Part
+from experiments.benchmarks.timing import Bench, Figure
+from experiments.runner import machine
+from vanejax.cad.part import Part
 from vanejax.rigid import RigidTransform
-from vanejax.scanner import scan_views
+from vanejax.scanner.camera import Camera
+from vanejax.scanner.virtual_scanner import scan_views
 
 SAMPLE = 9  # every ninth view stands for all: four azimuths of each elevation
 STRIPS = (1 << 12, 1 << 14, 1 << 16)  # rays given to Embree at once; the fastest counts

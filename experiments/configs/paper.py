@@ -1,6 +1,6 @@
 """The paper's letter: published RPM-Net loss, batches of one, no averaging of weights."""
 
-from experiments.experiment import Experiment, TrainingSettings
+from experiments.runner.experiment import Experiment, TrainingSettings
 
 
 def get_config() -> Experiment:

@@ -1,7 +1,7 @@
 """The default recipe on generic shapes, for `experiments.public_vs_virtual`."""
 
 from experiments.configs import vane
-from experiments.experiment import Experiment
+from experiments.runner.experiment import Experiment
 
 
 def get_config() -> Experiment:

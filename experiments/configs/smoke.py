@@ -1,6 +1,6 @@
 """The same pipeline in a minute: few pixels, few views, few points, a narrow network."""
 
-from experiments.experiment import (
+from experiments.runner.experiment import (
     DataSettings,
     Experiment,
     LossSettings,

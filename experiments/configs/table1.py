@@ -2,7 +2,8 @@
 
 import dataclasses
 
-from experiments.comparison import (
+from experiments.configs import vane
+from experiments.studies.comparison.settings import (
     Comparison,
     FgrSettings,
     IcpSettings,
@@ -11,7 +12,6 @@ from experiments.comparison import (
     SacIaSettings,
     TrainingOfNetworks,
 )
-from experiments.configs import vane
 
 
 def get_config() -> Comparison:

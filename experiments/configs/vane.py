@@ -1,6 +1,6 @@
 """The default recipe: the paper's data and network, with what was measured to train better."""
 
-from experiments.experiment import Experiment, LossSettings, TrainingSettings
+from experiments.runner.experiment import Experiment, LossSettings, TrainingSettings
 
 
 def get_config() -> Experiment:

@@ -1,7 +1,7 @@
 """The default recipe on scans without end: any view, another structured-light camera each time."""
 
-from experiments.endless import EndlessSettings
-from experiments.experiment import DataSettings, Experiment, LossSettings, TrainingSettings
+from experiments.runner.experiment import DataSettings, Experiment, LossSettings, TrainingSettings
+from experiments.runner.online import EndlessSettings
 
 
 def get_config() -> Experiment:

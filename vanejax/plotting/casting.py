@@ -8,12 +8,12 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 
-from vanejax.camera import Camera, hemisphere_viewpoints
-from vanejax.part import Part
+from vanejax.cad.part import Part
 from vanejax.plotting.canvas import FAINT, INK, new_figure
 from vanejax.plotting.deviation import DEVIATION_COLORMAP
 from vanejax.plotting.shading import crop, draw_part, shade
-from vanejax.scanner import Scan, Scanner
+from vanejax.scanner.camera import Camera, hemisphere_viewpoints
+from vanejax.scanner.virtual_scanner import Scan, Scanner
 
 # one hue that grows darker: stock has no middle to part from
 STOCK_COLORMAP = "YlGnBu"
@@ -33,7 +33,7 @@ def casting_map(part: Part, cast: Part) -> Figure:
 
     Args:
       part: the CAD model.
-      cast: its casting, in the same frame, as from `vanejax.casting.as_cast`.
+      cast: its casting, in the same frame, as from `vanejax.cad.investment_casting.as_cast`.
     """
     distance = 1.05 * cast.radius / np.sin(np.radians(_FIELD_DEG) / 2)
     camera = Camera(

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
 from vanejax.errors import InputError
-from vanejax.metrics import mean_per_axis, mean_per_view
+from vanejax.matching.metrics import mean_per_axis, mean_per_view
 from vanejax.plotting.canvas import GRID, INK, new_figure, style_chart
 
 # distinguishable for every kind of colour vision (Okabe and Ito, 2008)

@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from vanejax.camera import look_at
 from vanejax.errors import InputError
 from vanejax.plotting.canvas import INK, REFERENCE_RED, SOURCE_GREEN, new_figure
 from vanejax.pointcloud import voxel_thin
-from vanejax.scanner import Scan
+from vanejax.scanner.camera import look_at
+from vanejax.scanner.virtual_scanner import Scan
 
 # Where the reader stands, as a viewpoint of the hemisphere: oblique enough to see a tilt.
 READER_ELEVATION_DEG = 50.0

@@ -8,8 +8,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 
-from vanejax.measured_scan import MeasuredScan
-from vanejax.part import Part
+from vanejax.cad.part import Part
+from vanejax.localization.pose_result import PointStatus, PoseResult, Verification
 from vanejax.plotting.canvas import (
     INK,
     REFERENCE_RED,
@@ -18,8 +18,8 @@ from vanejax.plotting.canvas import (
     style_chart,
 )
 from vanejax.plotting.scene import Picture, Scene, reader_rotation, show
-from vanejax.pose_result import PointStatus, PoseResult, Verification
-from vanejax.rigid_transform import RigidTransform
+from vanejax.rigid import RigidTransform
+from vanejax.scans.measured_scan import MeasuredScan
 
 # blue below the surface, red above it; ColorBrewer's scale, safe for every kind of colour vision
 DEVIATION_COLORMAP = "RdYlBu_r"

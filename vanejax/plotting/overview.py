@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 from matplotlib.patches import ConnectionPatch
 
-from vanejax.camera import Camera
 from vanejax.plotting.canvas import FAINT, INK, REFERENCE_RED, SOURCE_GREEN, new_figure
 from vanejax.plotting.clouds import (
     Overlay,
@@ -21,7 +20,8 @@ from vanejax.plotting.clouds import (
     set_limits,
 )
 from vanejax.plotting.shading import crop, draw_part, shade
-from vanejax.scanner import Scan
+from vanejax.scanner.camera import Camera
+from vanejax.scanner.virtual_scanner import Scan
 
 _HEIGHT_IN, _GAP_IN = 3.4, 0.7
 

@@ -15,14 +15,14 @@ from matplotlib.colors import to_rgb
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vanejax.camera import Camera, look_at
-from vanejax.measured_scan import MeasuredScan
-from vanejax.part import Part
+from vanejax.cad.part import Part
 from vanejax.plotting.canvas import INK
 from vanejax.plotting.clouds import READER_AZIMUTH_DEG, READER_ELEVATION_DEG
 from vanejax.plotting.shading import shade
-from vanejax.rigid_transform import RigidTransform
-from vanejax.scanner import Scan, Scanner
+from vanejax.rigid import RigidTransform
+from vanejax.scanner.camera import Camera, look_at
+from vanejax.scanner.virtual_scanner import Scan, Scanner
+from vanejax.scans.measured_scan import MeasuredScan
 
 PART_METAL = "#b4bcc8"
 # part radii: a guess may be metres away, and would leave a picture of nothing

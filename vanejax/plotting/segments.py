@@ -7,13 +7,13 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from vanejax.camera import Camera
 from vanejax.errors import InputError
 from vanejax.plotting.canvas import INK, REFERENCE_RED, SOURCE_GREEN, new_figure
 from vanejax.plotting.shading import shade
-from vanejax.scanner import Scan
-from vanejax.scene import Scene
-from vanejax.segmentation import Segment, Segments
+from vanejax.scanner.camera import Camera
+from vanejax.scanner.clutter import Scene
+from vanejax.scanner.virtual_scanner import Scan
+from vanejax.scans.segmentation import Segment, Segments
 
 TABLE_SAND = "#d9c9a3"
 _COLORS = {

@@ -12,10 +12,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 
-from vanejax.measurement import Measurement, Reason
 from vanejax.plotting.canvas import INK, new_figure
 from vanejax.plotting.deviation import DEVIATION_COLORMAP
 from vanejax.plotting.shading import crop
+from vanejax.scanner.measurement import Measurement, Reason
 
 REASON_COLORS = {
     Reason.SHADOWED: "#3b3f46",

@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vanejax.camera import Camera
 from vanejax.errors import InputError
 from vanejax.plotting.canvas import new_figure
-from vanejax.scanner import Scan
+from vanejax.scanner.camera import Camera
+from vanejax.scanner.virtual_scanner import Scan
 
 _METAL = np.array([0.63, 0.68, 0.74])
 _BACKGROUND = np.array([1.0, 1.0, 1.0])

@@ -16,9 +16,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
+from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.measured_scan import MeasuredScan
-from vanejax.part import Part
+from vanejax.localization.pose_result import Alternative, PointStatus, PoseResult, Uncertainty
 from vanejax.plotting.deviation import (
     STATUS_COLORS,
     color_limit_mm,
@@ -28,7 +28,6 @@ from vanejax.plotting.deviation import (
     residual_histogram,
 )
 from vanejax.plotting.scene import Scene
-from vanejax.pose_result import Alternative, PointStatus, PoseResult, Uncertainty
 from vanejax.report.pictures import Image, color_bar, figure_uris, image
 from vanejax.report.templates import source, templates
 from vanejax.report.viewer import viewer
@@ -40,7 +39,8 @@ from vanejax.report.wording import (
     percent,
     significant,
 )
-from vanejax.rigid_transform import RigidTransform
+from vanejax.rigid import RigidTransform
+from vanejax.scans.measured_scan import MeasuredScan
 
 _PACKAGES = ("vanejax", "jax", "numpy", "scipy", "embreex", "trimesh")
 _MOST_PICTURES = 6

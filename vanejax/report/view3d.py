@@ -18,20 +18,20 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation, Slerp
 
+from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.measured_scan import MeasuredScan
-from vanejax.part import Part
+from vanejax.files import write_text
+from vanejax.localization.pose_result import PoseResult
 from vanejax.plotting.canvas import REFERENCE_RED, SOURCE_GREEN
 from vanejax.plotting.clouds import seen_and_hidden
 from vanejax.plotting.deviation import color_limit_mm
-from vanejax.pose_result import PoseResult
 from vanejax.report.pictures import color_bar
 from vanejax.report.templates import source, templates
 from vanejax.report.viewer import MAX_POINTS, scene_json, simplified, spacing_mm
 from vanejax.report.viewer import viewer as viewer_of_result
-from vanejax.rigid_transform import RigidTransform
-from vanejax.scanner import Scan
-from vanejax.whole_file import write_text
+from vanejax.rigid import RigidTransform
+from vanejax.scanner.virtual_scanner import Scan
+from vanejax.scans.measured_scan import MeasuredScan
 
 _HEIGHT_PX = 560
 # a reader who stands a little beside the camera sees some of its shadow

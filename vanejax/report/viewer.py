@@ -16,8 +16,8 @@ from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 from scipy.spatial import cKDTree
 
-from vanejax.measured_scan import MeasuredScan
-from vanejax.part import Part
+from vanejax.cad.part import Part
+from vanejax.localization.pose_result import PoseResult
 from vanejax.plotting.canvas import SOURCE_GREEN
 from vanejax.plotting.deviation import (
     DEVIATION_COLORMAP,
@@ -25,8 +25,8 @@ from vanejax.plotting.deviation import (
     color_limit_mm,
     overlay_rotation,
 )
-from vanejax.pose_result import PoseResult
-from vanejax.rigid_transform import RigidTransform
+from vanejax.rigid import RigidTransform
+from vanejax.scans.measured_scan import MeasuredScan
 
 MAX_VERTICES = 65_535
 MAX_POINTS = 60_000

@@ -1,0 +1,197 @@
+"""How things are timed: what all timings share, repeats, peers and limits, a table."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.runner import study_command as study
+from experiments.runner.vane_views import VaneViews, beside, magnitudes, pose_error, with_noise
+from vanejax.rigid import RigidTransform
+from vanejax.scans.measured_scan import MeasuredScan
+from vanejax.training.pretrained import find_weights
+from vanejax.training.weight_file import TrainedMatcher
+
+NOISE_MM, START_DEG, START_MM = 0.1, 5.0, 5.0
+LONG_S = 10.0  # from here on cold caches hardly count
+PIXELS = 128  # across, of the scans that are only counted
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """One thing timed.
+
+    Attributes:
+      name: of it, unique.
+      seconds: of each repeat, warm unless the note says otherwise; empty where it was skipped.
+      peers: names of figures of other programs that do the same; with each, how many times faster
+        than it this is to be, or None where nothing is asked.
+      limits: names of figures that are the least this could take; with each, how many times as
+        long this may take, or None.
+      goal_s: what the median should not exceed on two cores.
+      note: what else there is to say, such as the pose's error, or why it was skipped.
+    """
+
+    name: str
+    seconds: Sequence[float]
+    peers: Mapping[str, float | None] = dataclasses.field(default_factory=dict)
+    limits: Mapping[str, float | None] = dataclasses.field(default_factory=dict)
+    goal_s: float | None = None
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bench:
+    """What is timed, made when asked for.
+
+    Attributes:
+      repeats: of each timing.
+      seed: of noise and rough pose.
+      weights: file of a trained matcher for the guide vane, or None.
+      large: whether sizes that take minutes are wanted too.
+      views: of the guide vane.
+    """
+
+    repeats: int
+    seed: int
+    weights: Path | None
+    large: bool = False
+    views: VaneViews = dataclasses.field(default_factory=VaneViews)
+
+    @functools.cached_property
+    def view(self) -> int:
+        """The test view with most points, as seen at few pixels."""
+        camera = self.views.camera
+        coarse = dataclasses.replace(self.views, camera=camera.scaled(PIXELS / camera.width))
+        return max(self.views.select("test"), key=lambda view: len(coarse.points(view)))
+
+    @functools.cached_property
+    def points(self) -> np.ndarray:
+        """[N, 3] f64, mm, with noise."""
+        rng = np.random.default_rng(self.seed)
+        return with_noise(self.views.points(self.view), NOISE_MM, rng)
+
+    @property
+    def scan(self) -> MeasuredScan:
+        """The points as `register` takes them."""
+        return MeasuredScan(self.points, None, np.zeros(3), f"view {self.view}")
+
+    @functools.cached_property
+    def rough(self) -> RigidTransform:
+        """part_from_camera beside the true one."""
+        rng = np.random.default_rng([self.seed, 1])
+        truth = self.views.truth(self.view)
+        return beside(truth, self.views.part, deg=START_DEG, mm=START_MM, rng=rng)
+
+    @functools.cached_property
+    def matcher(self) -> TrainedMatcher | None:
+        """The weights, read."""
+        return None if self.weights is None else find_weights(self.weights, self.views.part)
+
+    def time(self, function: Callable[[], Any]) -> tuple[list[float], Any]:
+        """Seconds of each repeat after a first one that does not count, and what was returned."""
+        result, seconds = function(), []
+        for _ in range(self.repeats):
+            result = None  # what is large need not be in memory twice
+            began = time.perf_counter()
+            result = function()
+            seconds.append(time.perf_counter() - began)
+        return seconds, result
+
+    def time_sparingly(self, function: Callable[[], Any]) -> list[float]:
+        """Seconds of each repeat as `time`; what takes longer than `LONG_S` is run once only.
+
+        For what compiles nothing.
+        """
+        began = time.perf_counter()
+        function()
+        first = time.perf_counter() - began
+        return [first] if first > LONG_S else self.time(function)[0]
+
+    def error(self, part_from_camera: RigidTransform) -> str:
+        """How far a pose is off, in words."""
+        truth, center = self.views.truth(self.view), self.views.part.center
+        degrees, mm = magnitudes(pose_error(part_from_camera, truth, center))
+        return f"{degrees:.4f} deg, {mm:.4f} mm off"
+
+
+def summarize(figures: Sequence[Figure]) -> list[dict[str, Any]]:
+    """Rows with median, range and what each is compared with; None where something was skipped.
+
+    The ratio to a peer is how many times faster, that to a limit how many times as long.
+    """
+    medians = {
+        figure.name: float(np.median(figure.seconds)) for figure in figures if figure.seconds
+    }
+    rows = []
+    for figure in figures:
+        mine = medians.get(figure.name)
+        against = []
+        for kind, others in (("peer", figure.peers), ("limit", figure.limits)):
+            for name, goal in others.items():
+                theirs, ratio = medians.get(name), None
+                if mine is not None and theirs is not None:
+                    ratio = theirs / mine if kind == "peer" else mine / theirs
+                met = _word(ratio, goal, at_least=kind == "peer")
+                against.append(
+                    {"name": name, "kind": kind, "ratio": ratio, "goal": goal, "met": met}
+                )
+        rows.append(
+            {
+                "name": figure.name,
+                "seconds": study.spread(figure.seconds) if figure.seconds else None,
+                "repeats": len(figure.seconds),
+                "goal_s": figure.goal_s,
+                "met": _word(mine, figure.goal_s, at_least=False),
+                "against": against,
+                "note": figure.note,
+            }
+        )
+    return rows
+
+
+def _word(value: float | None, goal: float | None, *, at_least: bool) -> str | None:
+    """Whether a goal was "met" or "missed"; None where there is no goal or no value."""
+    if value is None or goal is None:
+        return None
+    return "met" if (value >= goal if at_least else value <= goal) else "missed"
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """The rows as aligned text, at most 100 columns wide but for long notes."""
+    lines = [f"{'':<46}{'median (s)':>11}{'min - max':>20}  goal (s)"]
+    for row in rows:
+        cells = f"{'-':>11}{'':>20}"
+        if row["seconds"]:
+            median, least, most = (shown(row["seconds"][k]) for k in ("median", "min", "max"))
+            cells = f"{median:>11}{f'{least} - {most}':>20}"
+        goal = ""
+        if row["goal_s"] is not None:
+            goal = f"  {row['goal_s']:g}" + (f": {row['met']}" if row["met"] else "")
+        lines.append(f"{row['name']:<46}{cells}{goal}".rstrip())
+        lines += [f"    {_comparison(entry)}" for entry in row["against"]]
+        if row["note"]:
+            lines.append(f"    {row['note']}")
+    return "\n".join(lines)
+
+
+def _comparison(entry: Mapping[str, Any]) -> str:
+    """Such as "6.21 times as fast as Open3D; at least 6: met"."""
+    if entry["ratio"] is None:
+        return f"not compared with {entry['name']}"
+    fast, bound = ("fast", "at least") if entry["kind"] == "peer" else ("long", "at most")
+    words = f"{entry['ratio']:.2f} times as {fast} as {entry['name']}"
+    if entry["met"] is None:
+        return words
+    return f"{words}; {bound} {entry['goal']:g}: {entry['met']}"
+
+
+def shown(seconds: float) -> str:
+    """A time for the table: to the millisecond, short ones to a tenth of it."""
+    return f"{seconds:.3f}" if seconds >= 0.1 else f"{seconds:.4f}"

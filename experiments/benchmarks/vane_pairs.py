@@ -1,0 +1,91 @@
+"""Pairs of real scans of the guide vane for timing RPM-Net: 717 source and 1,024 target points."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from experiments.configs.vane import get_config
+from experiments.runner.experiment import Experiment
+from vanejax.cad.parametric_vane import guide_vane
+from vanejax.scanner.camera import Camera, hemisphere_viewpoints
+from vanejax.training.dataset import ScanSet, make_scan_set
+from vanejax.training.pairs import Drawing, Pair, ScanBank, draw_pairs, make_bank
+from vanejax.training.train_step import TrainState, init_state, make_train_step
+
+SOURCES, TARGETS, NEIGHBORS = 717, 1024, 32
+ELEVATIONS_DEG, AZIMUTHS_DEG = (70.0,), (10.0, 100.0, 190.0, 280.0)
+
+
+@functools.cache
+def vane_scans() -> ScanSet:
+    """Four views at half the resolution, which leaves every voxel its point."""
+    part = guide_vane()
+    views = hemisphere_viewpoints(
+        part.center, elevations_deg=ELEVATIONS_DEG, azimuths_deg=AZIMUTHS_DEG
+    )
+    return make_scan_set(part, Camera().scaled(0.5), views, progress=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class VanePairs:
+    """RPM-Net of the default recipe on pairs of fixed size.
+
+    Attributes:
+      sources: N, all rows real.
+      targets: M.
+      neighbors: K.
+      batch: B.
+    """
+
+    sources: int = SOURCES
+    targets: int = TARGETS
+    neighbors: int = NEIGHBORS
+    batch: int = 4
+
+    @functools.cached_property
+    def config(self) -> Experiment:
+        """The default recipe with these sizes."""
+        config = get_config()
+        config.model.num_neighbors = self.neighbors
+        config.training.batch_size = self.batch
+        return config
+
+    @functools.cached_property
+    def bank(self) -> ScanBank:
+        """The scans, from each of which N points are drawn."""
+        bank = make_bank(vane_scans(), num_reference=self.targets)
+        return bank.replace(source_sizes=jnp.full_like(bank.source_sizes, self.sources))
+
+    @property
+    def drawing(self) -> Drawing:
+        """The recipe's, for these sizes."""
+        return Drawing(num_reference=self.targets, num_source=self.sources)
+
+    def pair(self, seed: int) -> Pair:
+        """One pair with a reference of its own."""
+        views = jnp.asarray([seed % len(AZIMUTHS_DEG)])
+        pairs = draw_pairs(jax.random.key(seed), self.bank, views, self.drawing)
+        first = jax.tree.map(lambda leaf: leaf[0], (pairs.source, pairs.target_from_source))
+        return Pair(source=first[0], target=pairs.target, target_from_source=first[1])
+
+    def state(self) -> TrainState:
+        """Untrained."""
+        model, optimizer = self.config.make_network().model, self.config.make_optimizer()
+        return init_state(model, optimizer, self.bank, self.drawing, seed=0)
+
+    def train_step(self):
+        """The jitted step of training: ``state, metrics = step(state, bank)``."""
+        return make_train_step(
+            self.config.make_network().model,
+            self.config.make_optimizer(),
+            self.config.make_network().loss,
+            self.drawing,
+            batch_size=self.batch,
+            seed=0,
+            average_decay=self.config.training.average_decay,
+            quick_compilation=self.config.training.quick_compilation,
+        )

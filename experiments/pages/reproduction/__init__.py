@@ -1,0 +1,1 @@
+"""The paper reproduced: claims, judgements and sections of one page."""

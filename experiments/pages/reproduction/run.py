@@ -1,0 +1,131 @@
+"""A run of the studies: one after the other, each in its own process and folder.
+
+What was finished before by the same command is not done again; what fails is told and does not
+stop the rest.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments.pages.reproduction.studies import INPUTS, Outcome, Study
+from experiments.runner.run_folder import git_commit, read_json, write_json
+from vanejax.errors import InputError
+
+_EXCERPT = 300  # characters of a log's last line
+
+
+def measured(studies: Sequence[Study], out: Path) -> dict[str, Any]:
+    """The same of what studies left under ``out``."""
+    found = {}
+    for study in studies:
+        path = study.folder(out) / study.written
+        if study.record and finished(study, out) and path.is_file():
+            found[study.record] = read_json(path)
+    return found
+
+
+def estimate(studies: Sequence[Study], out: Path, inputs: Mapping[str, str]) -> str:
+    """What would be done and how long it takes, as aligned text."""
+    lines, total = [], 0.0
+    for study in studies:
+        missing = [name for name in study.inputs if name not in inputs]
+        if missing:
+            told = f"needs --{missing[0].replace('_', '-')}"
+        elif finished(study, out):
+            told = "done before"
+        else:
+            told, total = f"{study.hours:5.2f} h", total + study.hours
+        lines.append(f"{study.name:<20}{told:<20}{study.title}".rstrip())
+    return "\n".join([*lines, f"{'together, about':<20}{total:5.2f} h on two cores"])
+
+
+def finished(study: Study, out: Path) -> bool:
+    """Whether this very command ended well in ``out`` and its result is still there."""
+    stamp = _stamp(study, out)
+    if not (stamp.is_file() and (study.folder(out) / study.written).is_file()):
+        return False
+    return read_json(stamp).get("arguments") == list(study.arguments)
+
+
+def run_studies(
+    studies: Sequence[Study],
+    out: Path,
+    inputs: Mapping[str, str],
+    *,
+    say: Callable[[str], None] = print,
+) -> list[Outcome]:
+    """Does the studies in order; every one has its outcome.
+
+    Args:
+      studies: those needed by others first.
+      out: folder; each study's own is inside, as are logs/NAME.txt and ended/NAME.json.
+      inputs: of `INPUTS`, those that there are.
+      say: told what goes on.
+
+    Raises:
+      InputError: the folder cannot be written.
+    """
+    try:
+        for name in ("logs", "ended"):
+            (out / name).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be used as a folder ({error.strerror})") from error
+    outcomes: dict[str, Outcome] = {}
+    for number, study in enumerate(studies, 1):
+        say(f"[{number}/{len(studies)}] {study.name}: {study.title}")
+        outcomes[study.name] = outcome = _outcome(study, out, inputs, outcomes)
+        say(f"    {outcome.state}" + (f": {outcome.why}" if outcome.why else ""))
+    return list(outcomes.values())
+
+
+def _outcome(
+    study: Study, out: Path, inputs: Mapping[str, str], before: Mapping[str, Outcome]
+) -> Outcome:
+    if missing := [name for name in study.inputs if name not in inputs]:
+        return Outcome(study, "not run", f"needs {INPUTS[missing[0]]}")
+    if finished(study, out):
+        return Outcome(study, "done before", seconds=read_json(_stamp(study, out))["seconds"])
+    for name in study.needs:
+        if name in before and not before[name].ended:
+            return Outcome(study, "not run", f"needs {name}, which {before[name].state}")
+    words = study.words({"out": out, **inputs})
+    log = out / "logs" / f"{study.name}.txt"
+    began = time.perf_counter()
+    with open(log, "w") as file:
+        done = subprocess.run(
+            [sys.executable, "-m", *words], stdout=file, stderr=subprocess.STDOUT, check=False
+        )
+    seconds = time.perf_counter() - began
+    if done.returncode:
+        return Outcome(study, "failed", f"exit code {done.returncode}: {_last(log)}", seconds)
+    if not (study.folder(out) / study.written).is_file():
+        return Outcome(study, "failed", f"it ended well but wrote no {study.written}", seconds)
+    stamp = {"arguments": study.arguments, "seconds": round(seconds, 1), "commit": git_commit()}
+    write_json(_stamp(study, out), stamp)
+    return Outcome(study, "done", seconds=seconds)
+
+
+def _stamp(study: Study, out: Path) -> Path:
+    return out / "ended" / f"{study.name}.json"
+
+
+def _last(log: Path) -> str:
+    """The last words of a log."""
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1][-_EXCERPT:] if lines else "it said nothing"
+
+
+def outcomes_json(outcomes: Sequence[Outcome]) -> str:
+    """What became of all, for a file."""
+    rows = [
+        {"study": o.study.name, "state": o.state, "why": o.why, "seconds": round(o.seconds, 1)}
+        for o in outcomes
+    ]
+    return json.dumps(rows, indent=2) + "\n"

@@ -1,0 +1,1 @@
+"""The topics of the page, each with its claims and its section."""

@@ -1,1 +1,0 @@
-"""What the report tells of: a module for each topic, with its claims, judgements and section."""

@@ -1,0 +1,1 @@
+"""What every experiment shares: config, command line, work folder, sweeps, evaluation."""

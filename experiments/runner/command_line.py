@@ -1,0 +1,166 @@
+"""What every experiment's command line shares: ``--config``, overrides, errors in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import functools
+import os
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from absl import app, flags, logging
+from ml_collections import config_flags
+
+from experiments.runner.experiment import Experiment
+from vanejax import compilation_cache
+from vanejax.errors import InputError
+
+CONFIG_FOLDER = Path(__file__).parent / "configs"
+flags.disclaim_key_flags()  # the flags defined here belong to the command that asks for them
+
+_OVERRIDE = re.compile(r"--?config\.([^=]+)")
+
+
+def define_config() -> flags.FlagHolder:
+    """Defines ``--config``; its value is what `run` is told it is once flags are parsed."""
+    names = ", ".join(sorted(path.name for path in CONFIG_FOLDER.glob("[!_]*.py")))
+    return config_flags.DEFINE_config_file(
+        "config",
+        None,
+        f"a file with get_config(), here or in experiments/configs/ ({names}). Any field can be "
+        "overridden: --config.model.num_neighbors=16",
+    )
+
+
+def define_workdir() -> flags.FlagHolder:
+    """Defines ``--workdir``; see `workdir` for its default."""
+    return flags.DEFINE_string(
+        "workdir",
+        None,
+        "folder of the run; if not given, runs/NAME with the config's name, and -NETWORK where "
+        "another network than RPM-Net is trained",
+    )
+
+
+def workdir(given: flags.FlagHolder, config: flags.FlagHolder) -> Path:
+    """The folder of the run."""
+    settings = config.value
+    network = settings.model.name if isinstance(settings, Experiment) else "rpmnet"
+    name = settings.name if network == "rpmnet" else f"{settings.name}-{network}"
+    return Path(given.value or f"runs/{name}")
+
+
+def run(main: Callable[[], int | None], *, tree: type = Experiment) -> None:
+    """Parses the command line, runs ``main`` and exits: 0, or 2 where the input is at fault.
+
+    ``tree`` is the dataclass that a config file's ``get_config()`` must return.
+
+    Compiled programs are kept: `vanejax.compilation_cache`.
+    """
+    # jaxlib announces things about TPUs and GPUs that are not there
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+
+    def guarded(rest: list[str]) -> int:
+        logging.set_verbosity(logging.ERROR)  # orbax tells of every file it writes
+        try:
+            if len(rest) > 1:
+                raise InputError(f"no such argument: {' '.join(rest[1:])}; see --help")
+            if flags.FLAGS.config is None:
+                raise InputError("--config is missing; try --config vane.py, or --help")
+            if not isinstance(flags.FLAGS.config, tree):
+                kind = type(flags.FLAGS.config).__name__
+                raise InputError(
+                    f"--config: the file holds settings of the kind {kind}, this command takes "
+                    f"{tree.__name__}; see --help"
+                )
+            compilation_cache.enable()
+            return main() or 0
+        except InputError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
+
+    try:
+        argv = resolve_config(sys.argv)
+        app.run(guarded, argv=argv, flags_parser=functools.partial(_parse, tree))
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+def resolve_config(argv: list[str]) -> list[str]:
+    """Replaces a bare config name by its path: the working folder first, then ours.
+
+    Raises:
+      InputError: no such file; names the ones there are.
+    """
+    argv = list(argv)
+    for index, argument in enumerate(argv):
+        name, equals, value = argument.partition("=")
+        if name not in ("--config", "-config"):
+            continue
+        if not equals:
+            if index + 1 == len(argv):
+                raise InputError("--config needs a file, such as --config vane.py")
+            value = argv[index + 1]
+        found = next((p for p in (Path(value), CONFIG_FOLDER / value) if p.is_file()), None)
+        if found is None:
+            there = ", ".join(sorted(p.name for p in CONFIG_FOLDER.glob("[!_]*.py")))
+            raise InputError(f"no config {value!r} here or in experiments/configs/: {there}")
+        if equals:
+            argv[index] = f"{name}={found}"
+        else:
+            argv[index + 1] = str(found)
+    return argv
+
+
+def _parse(tree: type, argv: list[str]) -> list[str]:
+    """Absl's parser, with overrides checked first so that a typo lists the right names."""
+    for argument in argv[1:]:
+        if match := _OVERRIDE.match(argument):
+            check_field(tree, match.group(1))
+    try:
+        return flags.FLAGS(argv)
+    except flags.IllegalFlagValueError as error:
+        match = _OVERRIDE.search(str(error))
+        wanted = f"; it takes {kind_of(tree, match.group(1))}" if match else ""
+        raise InputError(f"{error}{wanted}") from error
+    except (flags.Error, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{error}; see --help") from error
+
+
+def kind_of(tree: type, path: str) -> str:
+    """What a field holds, such as "an int, for example 32"."""
+    value: Any = tree()
+    for name in path.split("."):
+        value = getattr(value, name)
+    kind = type(value).__name__
+    return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}, for example {value!r}"
+
+
+def check_field(tree: type, path: str) -> None:
+    """Refuses a path such as ``model.num_neighbors`` that names no field of the tree.
+
+    Raises:
+      InputError: names what is there, and what is near.
+    """
+    node: Any = tree()
+    walked = "config"
+    for name in path.split("."):
+        names = [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
+        if name not in names:
+            near = difflib.get_close_matches(name, names, 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            right = f"its fields are: {', '.join(names)}" if names else "it has no fields"
+            raise InputError(f"--config.{path}: {walked} has no {name!r}{hint} ({right})")
+        node = getattr(node, name)
+        walked = f"{walked}.{name}"
+    if dataclasses.is_dataclass(node):
+        names = ", ".join(f.name for f in dataclasses.fields(node))
+        raise InputError(f"--config.{path} is a group; set one of its fields: {names}")

@@ -1,0 +1,99 @@
+"""The pictures of an evaluation: which figures of `vanejax.plotting` it draws, and of what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from experiments.runner.experiment import Experiment
+from experiments.runner.registrations import Results
+from vanejax import plotting
+from vanejax.cad.part import Part
+from vanejax.scanner.camera import hemisphere_viewpoints
+from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.training.dataset import ScanSet
+
+PORTRAIT_PIXELS = 2.0  # times the camera's per side: the picture is printed larger than a scan
+SURFACE_SAMPLES = 100_000  # so dense that hidden surface looks as solid as seen one
+PORTRAIT_DISTANCE = 6.0  # times the part's radius: the near plane must not cut it
+
+
+def draw(
+    results: Results,
+    scans: ScanSet,
+    hardest: np.ndarray,
+    log: Sequence[Mapping[str, float]],
+    folder: Path,
+) -> None:
+    """overlays.png, error_map.png, axis_errors.png and, with a log, training_curves.png."""
+    errors, views = results.errors, scans.viewpoints
+    figures = {
+        "overlays": plotting.registration_overlays(
+            [overlay(results, scans, view) for view in hardest]
+        ),
+        "error_map": plotting.error_map(
+            views.elevation_deg, views.azimuth_deg, errors.rotation_deg, errors.translation_mm
+        ),
+        "axis_errors": plotting.axis_errors(
+            {
+                "registration": plotting.AxisErrors(
+                    rotation_deg=errors.rotation_axes_deg,
+                    translation_mm=errors.translation_axes_mm,
+                )
+            }
+        ),
+    }
+    if log:
+        figures["training_curves"] = plotting.training_curves(log)
+    for name, figure in figures.items():
+        plotting.save_figure(figure, folder / f"{name}.png")
+
+
+def draw_with_part(
+    results: Results,
+    scans: ScanSet,
+    hardest: np.ndarray,
+    part: Part,
+    config: Experiment,
+    folder: Path,
+) -> None:
+    """view_and_shadow.png, Fig. 5 for the hardest views, and overview.png."""
+    scanner = Scanner(part, surface_samples=SURFACE_SAMPLES)
+    camera, views = config.make_camera(), scans.viewpoints
+    seen = [scanner.scan(camera, views.view(view), hidden=True) for view in hardest]
+    names = [
+        plotting.view_name(views.elevation_deg[view], views.azimuth_deg[view]) for view in hardest
+    ]
+    plotting.save_figure(plotting.view_and_shadow(seen, names), folder / "view_and_shadow.png")
+
+    fine = camera.scaled(PORTRAIT_PIXELS)
+    eye = hemisphere_viewpoints(
+        part.center,
+        distance_mm=max(PORTRAIT_DISTANCE * part.radius, camera.near_mm + 1.1 * part.radius),
+        elevations_deg=(plotting.READER_ELEVATION_DEG,),
+        azimuths_deg=(plotting.READER_AZIMUTH_DEG,),
+    )
+    portrait = scanner.scan(fine, eye.view(0))
+    shown = overlay(results, scans, hardest[0])
+    figure = plotting.overview_picture(portrait, fine, seen[0], shown)
+    plotting.save_figure(figure, folder / "overview.png")
+
+
+def overlay(results: Results, scans: ScanSet, view: int) -> plotting.Overlay:
+    """One registration as the figures want it: real points only, in mm."""
+    source, target = results.pairs.source, results.pairs.target
+    points = source.xyz[view][source.mask[view]]
+    found = results.registration.target_from_source
+    moved = points @ found.rotation[view].T + found.translation[view]
+    return plotting.Overlay(
+        source=scans.radius_mm * points,
+        moved=scans.radius_mm * moved,
+        reference=scans.radius_mm * target.xyz[view][target.mask[view]],
+        elevation_deg=scans.viewpoints.elevation_deg[view],
+        azimuth_deg=scans.viewpoints.azimuth_deg[view],
+        visible_fraction=scans.visible_fraction[view],
+        rotation_error_deg=float(results.errors.rotation_deg[view]),
+        translation_error_mm=float(results.errors.translation_mm[view]),
+    )

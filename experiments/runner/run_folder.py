@@ -1,0 +1,214 @@
+"""The folder of one training run: its config, what it ran on, its log and its lock."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import fcntl
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from experiments.runner.experiment import Experiment
+from experiments.runner.training_record import TrainingRecord
+from vanejax.cad.part import Part
+from vanejax.errors import InputError
+
+PACKAGES = ("vanejax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "embreex")
+CLOCK = "clock.json"
+
+
+class RunFolder:
+    """Owns a work folder while a run lasts; use as a context manager.
+
+    Raises:
+      InputError: the folder cannot be written, or another process is training in it.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self._events: Any = None
+
+    def __enter__(self) -> RunFolder:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = open(self.path / ".lock", "w")
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"{self.path}: another process is training there; choose another --workdir"
+            ) from None
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: cannot be used as a work folder ({error.strerror}); "
+                "choose another --workdir"
+            ) from error
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._events is not None:
+            self._events.close()
+        self._lock.close()
+
+    @property
+    def checkpoints(self) -> Path:
+        """Where the checkpoints are."""
+        return self.path / "checkpoints"
+
+    @property
+    def metrics(self) -> Path:
+        """The JSONL log."""
+        return self.path / "metrics.jsonl"
+
+    def claim(self, config: Experiment, part: Part) -> None:
+        """Records what runs here, or checks that it is the same as what ran here before.
+
+        Raises:
+          InputError: the folder holds a run of another config or part; names what differs.
+        """
+        settings = json.loads(json.dumps(dataclasses.asdict(config)))
+        mine = {"config": settings, "part": {"name": part.name, "sha256": part.sha256}}
+        record = self.path / "run.json"
+        if record.exists():
+            theirs = read_json(record)
+            changed = list(differences(theirs, mine))
+            if changed:
+                raise InputError(
+                    f"{self.path} holds a run of another experiment: {'; '.join(changed)}. "
+                    "Choose another --workdir, or give the config that it was started with."
+                )
+            return
+        environment = {
+            "versions": versions(),
+            "python": platform.python_version(),
+            "commit": git_commit(),
+            "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        }
+        write_json(record, mine | environment)
+
+    def claim_shapes(self, title: str, sha256: str) -> None:
+        """Records which generic shapes a run is trained on, or checks that they are the same.
+
+        Raises:
+          InputError: the run was begun with other shapes.
+        """
+        record, mine = self.path / "shapes.json", {"title": title, "sha256": sha256}
+        if not record.exists():
+            write_json(record, mine)
+        elif changed := list(differences(read_json(record), mine)):
+            raise InputError(f"{self.path} was begun with other shapes: {'; '.join(changed)}")
+
+    @property
+    def seconds(self) -> float:
+        """Time spent on training up to the last checkpoint, over all resumptions."""
+        return _read_seconds(self.path)
+
+    @seconds.setter
+    def seconds(self, value: float) -> None:
+        write_json(self.path / CLOCK, {"seconds": value})
+
+    def open_log(self, step: int) -> None:
+        """Readies the log for the rows after ``step``: what a killed run wrote beyond it goes."""
+        from tensorboardX import SummaryWriter  # takes a second to import
+
+        rows = [row for row in read_log(self.path) if row["step"] <= step]
+        text = "".join(json.dumps(row) + "\n" for row in rows)
+        write_text(self.metrics, text)
+        self._events = SummaryWriter(str(self.path / "events"), purge_step=step + 1)
+
+    def log(self, step: int, values: dict[str, float]) -> None:
+        """Appends a row to the JSONL log and to the TensorBoard events."""
+        with open(self.metrics, "a") as file:
+            file.write(json.dumps({"step": step} | values) + "\n")
+        for name, value in values.items():
+            self._events.add_scalar(name, value, step)
+
+
+def read_log(folder: str | os.PathLike[str]) -> list[dict[str, float]]:
+    """The rows of a run's JSONL log; a last line cut off by a kill is left out."""
+    path = Path(folder) / "metrics.jsonl"
+    rows = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(row, dict) and isinstance(row.get("step"), int):
+            rows.append(row)
+    return rows
+
+
+def training_record(folder: str | os.PathLike[str]) -> TrainingRecord:
+    """What the folder of a run knows of its training."""
+    return TrainingRecord(rows=read_log(folder), seconds=_read_seconds(Path(folder)))
+
+
+def _read_seconds(folder: Path) -> float:
+    clock = folder / CLOCK
+    return float(read_json(clock)["seconds"]) if clock.exists() else 0.0
+
+
+def read_json(path: Path) -> Any:
+    """A JSON file.
+
+    Raises:
+      InputError: it cannot be read.
+    """
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes JSON; the file appears complete or not at all."""
+    write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file; it appears complete or not at all."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(text)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def versions() -> dict[str, str | None]:
+    """Installed versions of the packages that a result rests on; None where run from a checkout."""
+    found: dict[str, str | None] = {}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def git_commit() -> str | None:
+    """The commit of the source tree, with "+" where it has changes; None outside of git."""
+    here = Path(__file__).parent
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(here), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:
+    """Which fields of ``new`` differ from ``old``, as readable sentences."""
+    if isinstance(new, dict) and isinstance(old, dict):
+        for key in new:
+            yield from differences(old.get(key), new[key], f"{path}.{key}" if path else key)
+    elif old != new:
+        yield f"{path} was {old!r}, now {new!r}"

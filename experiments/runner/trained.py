@@ -1,0 +1,100 @@
+"""A trained network for a comparison: trained here and now, or taken from the folder of a run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+from experiments.evaluate import load_variables
+from experiments.runner.experiment import Experiment
+from experiments.runner.run_folder import RunFolder, differences, read_json, training_record
+from experiments.runner.training_record import TrainingRecord
+from experiments.train import fit
+from vanejax.cad.part import Part
+from vanejax.errors import InputError
+from vanejax.matching.rpmnet import variables_from_torch
+from vanejax.matching.torch_weights import load_state_dict
+from vanejax.training.dataset import ScanSet
+from vanejax.training.train_step import Variables
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """Weights, and the run that they are of.
+
+    Attributes:
+      variables: averaged weights of the last step.
+      config: of the run.
+      record: of its training; None where only the weights are known.
+    """
+
+    variables: Variables
+    config: Experiment
+    record: TrainingRecord | None
+
+
+def trained(
+    config: Experiment, part: Part, scans: ScanSet, folder: Path, given: Path | None = None
+) -> Trained:
+    """Trains in ``folder``, going on where a run there was interrupted; or loads what is ``given``.
+
+    Args:
+      config: the network, and how it is trained.
+      part, scans: what for.
+      folder: of a run to begin, to go on with, or that is finished.
+      given: the folder of another run, or a file of RPM-Net's weights from PyTorch.
+
+    Raises:
+      InputError: the given folder holds a run of another network, part or kind of data.
+      TrainingDiverged, Interrupted: as `experiments.train.fit`.
+    """
+    if given is None:
+        with RunFolder(folder) as run:
+            run.claim(config, part)
+            variables = fit(config, part, scans, run).average
+        return Trained(variables, config, training_record(folder))
+    if given.is_file():
+        if config.model.name != "rpmnet":
+            raise InputError(f"{given}: weights from PyTorch are read for an RPM-Net only")
+        return Trained(variables_from_torch(load_state_dict(given)), config, None)
+    record = read_json(given / "run.json")
+    mine = json.loads(json.dumps(dataclasses.asdict(config)))
+    theirs = record.get("config", {})
+    # what decides how a network is built and tested; how it was trained is told, not asked for
+    groups = ("part", "views", "data", "model", config.model.name)
+    names = [name for name in groups if name in mine]
+    found = list(
+        differences(
+            {name: theirs.get(name) for name in names}, {name: mine[name] for name in names}
+        )
+    )
+    if record.get("part", {}).get("sha256") != part.sha256:
+        found.append(f"it is about the part {record.get('part', {}).get('name')}")
+    if found:
+        raise InputError(f"{given}: is no run for this comparison: {'; '.join(found)}")
+    for name in ("training", "loss"):
+        if isinstance(theirs.get(name), dict):
+            settings = getattr(config, name)
+            known = {field.name for field in dataclasses.fields(settings)}
+            values = {key: value for key, value in theirs[name].items() if key in known}
+            setattr(config, name, dataclasses.replace(settings, **values))
+    return Trained(load_variables(config, scans, given), config, training_record(given))
+
+
+def given_runs(words: Iterable[str], names: Iterable[str]) -> dict[str, Path]:
+    """Folders, or files of weights, by network from ``NAME=PATH`` arguments.
+
+    Raises:
+      InputError: no such network or path, or an argument of another form.
+    """
+    runs: dict[str, Path] = {}
+    for word in words:
+        name, equals, folder = word.partition("=")
+        if not equals or name not in names:
+            raise InputError(f"--trained {word}: should be NAME=PATH with {', '.join(names)}")
+        if not Path(folder).exists():
+            raise InputError(f"--trained {word}: there is no {folder}")
+        runs[name] = Path(folder)
+    return runs

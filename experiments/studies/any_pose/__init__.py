@@ -1,0 +1,1 @@
+"""The guide vane from uniformly random rotations, without an initial guess."""

@@ -1,0 +1,1 @@
+"""The comparison of methods: settings, methods, tables, pictures."""

@@ -1,0 +1,347 @@
+"""The paper's test stand (Fig. 12), virtually: stage, camera, probe, and the cube that joins them.
+
+The camera stands still. A stage carries the guide vane: it turns about its R axis and moves along
+X, Y, Z, which are not quite where the drawing has them. The probe's machine has a frame of its own,
+two metres away.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from experiments.runner.vane_views import pose_error
+from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cad.surface import Surface
+from vanejax.errors import InputError
+from vanejax.localization.residuals import RayCasting
+from vanejax.machine.calibration import Calibration, averaged, calibrate
+from vanejax.machine.calibration_cube import SIDE_MM, Cube, cube_faces, cube_of
+from vanejax.rigid import RigidTransform
+from vanejax.scanner.measurement import measure
+from vanejax.scanner.range_errors import Lens, Trueness
+from vanejax.scanner.sensor import Sensor
+from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scans.measured_scan import MeasuredScan
+
+PROBE_MM = 0.015  # of the paper's probe, taken as the standard deviation along each axis
+FLATNESS_MM = 0.02  # of the cube's faces, and how far they are from square over its side
+ASKEW_DEG, ASIDE_MM = 0.5, 1.0  # of the stage from its drawing, standard deviations
+AXIS_BESIDE_MM = 8.0  # from the R axis to the part's centre
+PLACEMENTS, TOUCHED = 8, 9  # of the cube, and points on each of its faces
+TRIES = 10  # to place the cube so that all three faces are seen
+CUBE_TILT_DEG = 8.0
+MOVES_MM = (
+    (20.0, 0.0, 0.0), (40.0, 0.0, 0.0), (-30.0, 0.0, 0.0),
+    (0.0, 15.0, 0.0), (0.0, 25.0, 0.0), (0.0, -20.0, 0.0),
+    (0.0, 0.0, 15.0), (0.0, 0.0, 30.0), (0.0, 0.0, -25.0),
+    (20.0, 15.0, 10.0), (-25.0, -15.0, -20.0),
+)  # fmt: skip
+# what four cone-shaped dents on the platform are probed at, mm from the part's centre
+DENTS_MM = ((-90.0, -70.0, -30.0), (90.0, -70.0, -30.0), (90.0, 70.0, -30.0), (-90.0, 70.0, -30.0))
+BIAS_POINTS = 4_000
+FAR_MM = 0.5  # from the part: such points do not take part in a registration
+LEAST_COSINE = 0.2
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Stand:
+    """One camera, one part, one stage, one measuring machine.
+
+    Attributes:
+      part: in its own frame.
+      sensor: this camera, with the errors of its calibration.
+      camera_from_part: at the initial position.
+      camera_from_stage: where the stage's axes are, its R axis along z through its origin.
+      nominal_from_stage: the same by the drawing.
+      machine_from_camera: what the calibration should find.
+    """
+
+    part: Part
+    sensor: Sensor
+    camera_from_part: RigidTransform
+    camera_from_stage: RigidTransform
+    nominal_from_stage: RigidTransform
+    machine_from_camera: RigidTransform
+
+    @classmethod
+    def built(
+        cls, part: Part, sensor: Sensor, camera_from_part: RigidTransform, rng: np.random.Generator
+    ) -> Stand:
+        """A stage about the part as ``camera_from_part`` has it, and a machine somewhere.
+
+        The part's z is along the R axis but for the tolerances of the mounting.
+        """
+        aside = RigidTransform(np.eye(3), part.center + np.array([AXIS_BESIDE_MM, 0.0, 0.0]))
+        nominal = camera_from_part @ aside
+        slip = RigidTransform(
+            Rotation.from_rotvec(np.radians(ASKEW_DEG) * rng.standard_normal(3)).as_matrix(),
+            ASIDE_MM * rng.standard_normal(3),
+        )
+        machine = RigidTransform(
+            Rotation.random(rng=rng).as_matrix(), np.array([600.0, -500.0, 1800.0])
+        )
+        return cls(part, sensor, camera_from_part, nominal @ slip, nominal, machine)
+
+    @functools.cached_property
+    def model(self) -> RayCasting:
+        """Predicts the camera's scans of the part."""
+        return RayCasting(Scanner(self.part), Surface(self.part), np.zeros(3))
+
+    @property
+    def axis(self) -> np.ndarray:
+        """[3] unit, the drawing's R axis, camera frame."""
+        return self.nominal_from_stage.rotation[:, 2]
+
+    def moved(self, stage: RigidTransform) -> RigidTransform:
+        """The part's true motion in the camera's frame when the stage does ``stage`` in its own."""
+        return self.camera_from_stage @ stage @ self.camera_from_stage.inverse()
+
+    def expected(self, stage: RigidTransform) -> RigidTransform:
+        """The same by the drawing."""
+        return self.nominal_from_stage @ stage @ self.nominal_from_stage.inverse()
+
+    def truth(self, stage: RigidTransform) -> RigidTransform:
+        """part_from_camera after the stage's motion."""
+        return (self.moved(stage) @ self.camera_from_part).inverse()
+
+    def scan(self, stage: RigidTransform, rng: np.random.Generator) -> MeasuredScan:
+        """What the camera measures after the stage's motion."""
+        measured = measure(self.model.scanner, self.sensor, self.truth(stage).inverse(), rng)
+        return MeasuredScan(measured.points.astype(np.float64), None, np.zeros(3))
+
+    def probed(self, stage: RigidTransform, rng: np.random.Generator) -> np.ndarray:
+        """[4, 3] mm, machine frame: the platform's dents after the stage's motion."""
+        there = self.machine_from_camera @ self.moved(stage) @ self.camera_from_part
+        dents = there.apply(self.part.center + np.array(DENTS_MM))
+        return dents + PROBE_MM * rng.standard_normal(dents.shape)
+
+
+def turns(positions: int) -> list[RigidTransform]:
+    """Motions of the stage about its R axis, from the initial position on round the full turn."""
+    angles = 2 * np.pi * np.arange(positions) / positions
+    return [
+        RigidTransform(Rotation.from_rotvec([0, 0, a]).as_matrix(), np.zeros(3)) for a in angles
+    ]
+
+
+def moves(positions: int) -> list[RigidTransform]:
+    """Motions of the stage along X, Y, Z: one axis at a time, then all; the first is none.
+
+    Raises:
+      InputError: more positions than there are.
+    """
+    if not 2 <= positions <= 1 + len(MOVES_MM):
+        raise InputError(f"positions must be from 2 to {1 + len(MOVES_MM)}, got {positions}")
+    shifts = np.concatenate([np.zeros((1, 3)), np.array(MOVES_MM)])[:positions]
+    return [RigidTransform(np.eye(3), shift) for shift in shifts]
+
+
+# The cube.
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Block:
+    """A calibration cube as it was ground: corner at the origin, material at x, y, z < 0.
+
+    Attributes:
+      waves: [3, 2, 4] of three faces: length (mm), direction and phase (rad), weight of two waves.
+      lean: [3, 3] what makes the faces not quite square.
+    """
+
+    waves: np.ndarray
+    lean: np.ndarray
+
+    @classmethod
+    def ground(cls, rng: np.random.Generator) -> Block:
+        """Faces within their flatness, square within theirs."""
+        waves = np.stack(
+            [
+                rng.uniform(50, 120, (3, 2)),
+                rng.uniform(0, np.pi, (3, 2)),
+                rng.uniform(0, 2 * np.pi, (3, 2)),
+                rng.uniform(0.3, 1, (3, 2)),
+            ],
+            axis=-1,
+        )
+        grid = np.stack(np.meshgrid(*2 * [np.linspace(-SIDE_MM, 0, 31)]), axis=-1).reshape(-1, 2)
+        for face in waves:
+            face[:, 3] *= FLATNESS_MM / np.ptp(_height(face, grid))
+        lean = np.eye(3) + rng.uniform(-0.5, 0.5, (3, 3)) * FLATNESS_MM / SIDE_MM * (1 - np.eye(3))
+        return cls(waves, lean)
+
+    def on_face(self, k: int, places: np.ndarray) -> np.ndarray:
+        """[N, 3] mm: points of face k, whose normal is along axis k, at [N, 2] of the others."""
+        points = np.insert(places, k, _height(self.waves[k], places), axis=1)
+        return points @ self.lean.T
+
+    @functools.cached_property
+    def part(self) -> Part:
+        """As a solid."""
+        box = trimesh.creation.box(extents=[SIDE_MM] * 3)
+        for _ in range(4):
+            box = box.subdivide()
+        flat = np.asarray(box.vertices) - SIDE_MM / 2
+        vertices = flat.copy()
+        for k in range(3):
+            # fades towards the face on the other side, which nobody sees
+            vertices[:, k] += _height(self.waves[k], np.delete(flat, k, axis=1)) * (
+                1 + flat[:, k] / SIDE_MM
+            )
+        return part_from_mesh(vertices @ self.lean.T, np.asarray(box.faces), name="cube")
+
+
+def _height(waves: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """[N] mm of two waves [2, 4] at places [N, 2]."""
+    length, direction, phase, weight = waves.T
+    along = places @ np.stack([np.cos(direction), np.sin(direction)])
+    return np.sin(2 * np.pi * along / length + phase) @ weight
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Placed:
+    """One placement of the cube, as both instruments have it.
+
+    Attributes:
+      scanned: three arrays [n, 3] mm, camera frame, of the scan's points on each face.
+      touched: three arrays [TOUCHED, 3] mm, machine frame.
+    """
+
+    scanned: list[np.ndarray]
+    touched: list[np.ndarray]
+
+    @property
+    def touched_cube(self) -> Cube:
+        """As the machine has it."""
+        return cube_of(self.touched, noise_mm=PROBE_MM)
+
+    @property
+    def scanned_cube(self) -> Cube:
+        """As the camera has it."""
+        return cube_of(self.scanned)
+
+
+def place_cubes(stand: Stand, rng: np.random.Generator) -> list[Placed]:
+    """The cube at eight places before the camera, scanned and touched.
+
+    A placement that hides a face from the camera or the projector is given up for another, as one
+    would at the stand.
+    """
+    block = Block.ground(rng)
+    scanner = Scanner(block.part)
+    return [_placed(stand, block, scanner, rng) for _ in range(PLACEMENTS)]
+
+
+def _placed(stand: Stand, block: Block, scanner: Scanner, rng: np.random.Generator) -> Placed:
+    for _ in range(TRIES):
+        camera_from_cube = _corner_up(rng)
+        points = measure(scanner, stand.sensor, camera_from_cube, rng).points.astype(np.float64)
+        try:
+            label = cube_faces(points)
+        except InputError:
+            continue
+        machine_from_cube = stand.machine_from_camera @ camera_from_cube
+        touched = []
+        for k in range(3):
+            steps = np.linspace(-0.9, -0.1, round(np.sqrt(TOUCHED))) * SIDE_MM
+            places = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+            places = places + rng.uniform(-3, 3, places.shape)
+            exact = machine_from_cube.apply(block.on_face(k, places))
+            touched.append(exact + PROBE_MM * rng.standard_normal(exact.shape))
+        return Placed([points[label == k] for k in range(3)], touched)
+    raise InputError(f"no placement of {TRIES} showed three faces of the cube to the camera")
+
+
+def _corner_up(rng: np.random.Generator) -> RigidTransform:
+    """camera_from_cube: the corner towards the camera, somewhere in its view."""
+    up = Rotation.align_vectors([[0, 0, 1]], [[1, 1, 1]])[0]
+    spin = Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)])
+    tilt = Rotation.from_rotvec(np.radians(rng.uniform(-CUBE_TILT_DEG, CUBE_TILT_DEG, 3)))
+    corner = np.array([*rng.uniform(-1, 1, 2) * [60, 30], -390 + rng.uniform(-30, 30)])
+    return RigidTransform((tilt * spin * up).as_matrix(), corner)
+
+
+def calibrations(placed: list[Placed]) -> tuple[Calibration, Calibration]:
+    """By all planes at once, and by the paper's mean."""
+    seen = [one.scanned_cube for one in placed]
+    touched = [one.touched_cube for one in placed]
+    return calibrate(seen, touched), averaged(seen, touched)
+
+
+# What the camera's own calibration does.
+
+
+def causes(kind: Sensor) -> list[Sensor]:
+    """A kind of camera with one error of its calibration each, of one standard deviation.
+
+    Those that `Sensor.another` draws.
+    """
+    bare = dataclasses.replace(kind, lens=None, trueness=None)
+    found = []
+    if kind.lens is not None:
+        for name in ("k1", "k2", "p1", "p2", "focal_error"):
+            lens = Lens(**{name: getattr(kind.lens, name)})
+            found.append(dataclasses.replace(bare, lens=lens))
+        for center in np.diag(kind.lens.center_error_px):
+            found.append(dataclasses.replace(bare, lens=Lens(center_error_px=tuple(center))))
+    if kind.trueness is not None:
+        found.append(dataclasses.replace(bare, trueness=Trueness(scale=kind.trueness.scale)))
+        for bend in np.diag(kind.trueness.bend_mm):
+            found.append(dataclasses.replace(bare, trueness=Trueness(bend_mm=tuple(bend))))
+    return found
+
+
+def shifts_mm(sensor: Sensor, points: np.ndarray) -> np.ndarray:
+    """[N, 3]: how far the errors of a sensor's calibration move measured points [N, 3]."""
+    camera, depth = sensor.camera, -points[:, 2]
+    out = np.zeros_like(points)
+    if sensor.trueness is not None:
+        x, y = (camera.project(points) / [camera.width / 2, camera.height / 2] - 1).T
+        out += points * (sensor.trueness.error_mm(depth, x, y) / depth)[:, None]
+    if sensor.lens is not None:
+        x, y = points[:, 0] / depth, points[:, 1] / depth
+        for axis, shift in enumerate(sensor.lens.shifts(x, y, fx=camera.fx, fy=camera.fy)):
+            out[:, axis] += depth * shift
+    return out
+
+
+def pose_bias(
+    stand: Stand, scan: MeasuredScan, pose: RigidTransform, errors: list[Sensor]
+) -> np.ndarray:
+    """[6, K]: what each of K errors of calibration does to a registered pose part_from_camera.
+
+    To first order, least squares along the rays: the truth is that small motion after the pose.
+    """
+    rng = np.random.default_rng(0)
+    points = scan.points[rng.permutation(len(scan.points))[:BIAS_POINTS]]
+    batch = RigidTransform(pose.rotation[None], pose.translation[None])
+    now = stand.model.residuals(batch, points, feet="samples")
+    on = now.hit[0] & (np.abs(now.deviation_mm[0]) < FAR_MM) & (now.cosine[0] > LEAST_COSINE)
+    columns = now.jacobian[0][on] / now.cosine[0][on, None]
+    normals = now.jacobian[0][on, 3:] @ pose.rotation
+    moved = [np.einsum("ni,ni->n", normals, shifts_mm(error, points[on])) for error in errors]
+    along = np.stack(moved, axis=1) / now.cosine[0][on, None]
+    return np.linalg.solve(columns.T @ columns, columns.T @ along)
+
+
+def frame_bias(placed: list[Placed], found: Calibration, errors: list[Sensor]) -> np.ndarray:
+    """[6, K]: what the same errors do to machine_from_camera, about ``found.center``."""
+    touched = [one.touched_cube for one in placed]
+    thin = [
+        Placed([some[:: max(1, len(some) // 500)] for some in one.scanned], one.touched)
+        for one in placed
+    ]
+    start = calibrate([one.scanned_cube for one in thin], touched).machine_from_camera
+    columns = []
+    for error in errors:
+        wrong = [
+            Placed([some + shifts_mm(error, some) for some in one.scanned], one.touched)
+            for one in thin
+        ]
+        other = calibrate([one.scanned_cube for one in wrong], touched).machine_from_camera
+        columns.append(pose_error(other, start, found.center))
+    return np.stack(columns, axis=1)

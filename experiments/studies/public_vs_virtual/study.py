@@ -1,0 +1,189 @@
+"""RPM-Net trained on generic shapes against RPM-Net trained on virtual scans (paper, Figs 8, 9).
+
+python -m experiments.public_vs_virtual --config public.py [--workdir runs/public]
+    [--config.data.shapes=PATH] [--trained virtual=runs/vane] [--config.FIELD=VALUE ...]
+    [--trained public=partial-trained.pth]
+
+Both have the same network, loss, optimizer and number of steps; only what they see differs. Both
+register the same 54 test views of the part. ``data.shapes`` is where ModelNet40 is, a file of
+shapes, or "solids" for a procedural family of solids. A checkpoint of the published PyTorch code
+may stand in for the network trained on public shapes.
+
+VANEJAX_CACHE_DIR is where compiled programs are kept (~/.cache/vanejax); off keeps none.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import datetime
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.compare import figures, training_told
+from experiments.evaluate import registered
+from experiments.runner import study_command as study
+from experiments.runner.evaluation_report import hardest_views
+from experiments.runner.experiment import Experiment
+from experiments.runner.machine import cores, cpu_model
+from experiments.runner.registrations import Results
+from experiments.runner.run_folder import git_commit, read_json, versions
+from experiments.runner.trained import given_runs, trained
+from experiments.studies.comparison.table import training_line
+from experiments.train import exit_code, load_or_scan
+from vanejax import plotting
+from vanejax.errors import InputError
+from vanejax.matching.metrics import mean_per_axis, mean_per_view
+from vanejax.training.dataset import ScanSet
+
+PUBLIC, VIRTUAL = "public", "virtual"
+PAPER_REDUCTION = 0.8  # "a combined reduction of approximately 80%"
+
+
+def of_virtual_scans(config: Experiment) -> Experiment:
+    """The same recipe, trained on scans of the part."""
+    config = copy.deepcopy(config)
+    config.name = f"{config.name}-{VIRTUAL}"
+    config.data.shapes = ""
+    return config
+
+
+def public_vs_virtual(
+    config: Experiment, workdir: Path, runs: Mapping[str, Path], *, progress: bool = True
+) -> dict[str, Any]:
+    """Trains both networks where no run is given, and compares them on the part's test views.
+
+    Args:
+      config: recipe, with ``data.shapes`` set.
+      workdir: receives the runs, public_vs_virtual.json and pictures.
+      runs: folders of finished runs, under "public" and "virtual".
+      progress: whether to show progress bars.
+
+    Returns:
+      What public_vs_virtual.json holds.
+
+    Raises:
+      InputError: settings, parts or folders that cannot be used.
+    """
+    config.check()
+    if not config.data.shapes:
+        raise InputError(
+            "config.data.shapes is empty: name a ModelNet40 folder, a file of shapes, or solids"
+        )
+    part = config.make_part()
+    workdir.mkdir(parents=True, exist_ok=True)
+    scans = load_or_scan(config, part, workdir / "scans.npz")
+    sources, results = {}, {}
+    for name, settings in ((VIRTUAL, of_virtual_scans(config)), (PUBLIC, config)):
+        print(f"trained on {name} data: {runs.get(name, 'training')}")
+        folder = runs.get(name, workdir / name)
+        network = trained(settings, part, scans, workdir / name, runs.get(name))
+        shapes = folder / "shapes.json"
+        told = {"title": "virtual scans of the part"}
+        if folder.is_file():
+            told = {"title": f"whatever {folder.name} was trained on"}
+        elif shapes.exists():
+            told = read_json(shapes)
+        sources[name] = told | {"training": training_told(network)}
+        results[name] = registered(settings, scans, network.variables, progress=progress)
+    report = {
+        "name": config.name,
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "machine": {"cpu": cpu_model(), "cores": cores()},
+        "commit": git_commit(),
+        "versions": versions(),
+        "part": {"name": part.name, "sha256": part.sha256},
+        "seed": config.seed,
+        "config": dataclasses.asdict(config),
+        "trained_on": sources,
+    } | compared(results, scans.test)
+    report = study.save(workdir, "public_vs_virtual", report)
+    for title, views in (("hardest", hardest_views(scans.test)), ("all", slice(None))):
+        series = {
+            sources[name]["title"]: plotting.AxisErrors(
+                rotation_deg=found.errors.rotation_axes_deg[views],
+                translation_mm=found.errors.translation_axes_mm[views],
+            )
+            for name, found in results.items()
+        }
+        plotting.save_figure(plotting.axis_errors(series), workdir / f"axis_errors_{title}.png")
+    print(table(report))
+    return report
+
+
+def compared(results: Mapping[str, Results], test: ScanSet) -> dict[str, Any]:
+    """Errors of both on all test views and on the hardest, and by how much one is lower."""
+    rows = {"all": np.arange(len(test)), "hardest": hardest_views(test)}
+    report: dict[str, Any] = {"views": {name: len(views) for name, views in rows.items()}}
+    for name, found in results.items():
+        report[name] = figures(found, test)
+    for name, views in rows.items():
+        errors = {
+            source: {
+                "mre_per_axis_deg": mean_per_axis(found.errors.rotation_axes_deg[views]),
+                "mte_per_axis_mm": mean_per_axis(found.errors.translation_axes_mm[views]),
+                "mre_per_view_deg": mean_per_view(found.errors.rotation_axes_deg[views]),
+                "mte_per_view_mm": mean_per_view(found.errors.translation_axes_mm[views]),
+            }
+            for source, found in results.items()
+        }
+        turned, moved = (
+            1.0 - float(np.mean(errors[VIRTUAL][key]) / np.mean(errors[PUBLIC][key]))
+            for key in ("mre_per_axis_deg", "mte_per_axis_mm")
+        )
+        report[f"{name}_views"] = errors | {
+            "reduction": {
+                "rotation": turned,
+                "translation": moved,
+                "combined": 0.5 * (turned + moved),
+                "paper": PAPER_REDUCTION,
+            }
+        }
+    return report
+
+
+def table(report: Mapping[str, Any]) -> str:
+    """Markdown: MRE and MTE per axis of both, and the reduction beside the paper's."""
+    lines = [
+        "| trained on | views | MRE x, y, z (deg) | MTE x, y, z (mm) | rotation (deg) | "
+        "translation (mm) |",
+        "|---|---|---|---|---|---|",
+    ]
+    for views in ("hardest", "all"):
+        for name in (PUBLIC, VIRTUAL):
+            errors = report[f"{views}_views"][name]
+            summary = report[name]["hardest" if views == "hardest" else "summary"]
+            axes = (
+                ", ".join(f"{value:.2f}" for value in errors[key])
+                for key in ("mre_per_axis_deg", "mte_per_axis_mm")
+            )
+            means = (
+                f"{summary[key]['mean']:.2f}"
+                for key in ("rotation_error_deg", "translation_error_mm")
+            )
+            count = f"{report['views'][views]}, {views}"
+            lines.append(
+                f"| {report['trained_on'][name]['title']} | {count} | "
+                + " | ".join([*axes, *means])
+                + " |"
+            )
+    for views in ("hardest", "all"):
+        fall = report[f"{views}_views"]["reduction"]
+        lines += [
+            "",
+            f"Virtual scans lower the error by {fall['combined']:.0%} on the {views} views "
+            f"(rotation {fall['rotation']:.0%}, translation {fall['translation']:.0%}); the paper "
+            f"says about {fall['paper']:.0%}.",
+        ]
+    trained_on = [told for told in report["trained_on"].values() if told["training"]]
+    lines += ["", *(training_line(told["title"], told["training"]) for told in trained_on)]
+    return "\n".join(lines)
+
+
+def main(config: Experiment, workdir: Path, words: list[str]) -> int:
+    """Compares; the exit code."""
+    runs = given_runs(words, (PUBLIC, VIRTUAL))
+    return exit_code(lambda: public_vs_virtual(config, workdir, runs), workdir)

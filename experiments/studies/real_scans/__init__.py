@@ -1,0 +1,1 @@
+"""Registers real scans without guess or training, against ground truth."""

@@ -1,0 +1,1 @@
+"""How registration stands what happens at a machine: distance, angle, light, clutter, casting."""

@@ -1,0 +1,265 @@
+"""What disturbs a scan, one thing at a time: distance, angle, light, clutter, casting, noise."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from vanejax.cad.investment_casting import Casting, as_cast
+from vanejax.cad.part import Part
+from vanejax.rigid import RigidTransform
+from vanejax.scanner.camera import hemisphere_viewpoints
+from vanejax.scanner.clutter import Clutter, clutter_scene
+from vanejax.scanner.measurement import Measurement, Reason, measure
+from vanejax.scanner.sensor import Sensor, preset
+from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scans.segmentation import segment
+from vanejax.training.online_scans import RandomViews
+
+DISTANCE_MM = 400.0
+ELEVATION_DEG = 75.0
+BISECTIONS = 14
+MOST_STOPS = 8.0  # how far exposure is turned up or down to make holes, powers of two
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Disturbed:
+    """A scan to register.
+
+    Attributes:
+      points: [N, 3] f64, mm, camera frame: what is taken for the part.
+      part_from_camera: the truth.
+      measured: what the sensor measured, all of it.
+      foreign_share: of ``points``, those that are not of the part.
+    """
+
+    points: np.ndarray
+    part_from_camera: RigidTransform
+    measured: Measurement
+    foreign_share: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Series:
+    """One kind of disturbance at growing strength.
+
+    Attributes:
+      name: for files, and ``title`` for readers.
+      unit: of ``values``.
+      values: strengths.
+      views: how many scans there are at each.
+      take: ``take(value, number)`` makes scan ``number`` at this strength; same arguments, same
+        bits.
+      max_allowance_mm: of the fine registration: how much stock it may find; 0 for none.
+      paper: the paper's mean RMSE and FFMDE over this series, mm, where it has one (Fig. 11).
+    """
+
+    name: str
+    title: str
+    unit: str
+    values: Sequence[float]
+    views: int
+    take: Callable[[float, int], Disturbed]
+    max_allowance_mm: float = 0.0
+    paper: tuple[float, float] | None = None
+
+
+def make_series(part: Part, *, views: int, seed: int, sensor: str = "paper_camera") -> list[Series]:
+    """All series on one part by cameras of one kind.
+
+    Args:
+      part: stands still; cameras see it at `ELEVATION_DEG` and more.
+      views: scans at each strength; each is by another camera of the kind.
+      seed: of all.
+      sensor: a name of `vanejax.scanner.sensor.PRESETS`.
+    """
+    stand = _Stand(part, preset(sensor), seed)
+    return [
+        Series(
+            "distance",
+            "Distance",
+            "mm",
+            (300.0, 350.0, 400.0, 450.0, 500.0, 600.0, 800.0, 1000.0),
+            views,
+            stand.at_distance,
+            paper=(0.7951, 0.3620),
+        ),
+        Series(
+            "angle",
+            "Angle",
+            "deg",
+            tuple(float(angle) for angle in range(0, 360, 10)),
+            1,
+            stand.at_angle,
+            paper=(0.7904, 0.3620),
+        ),
+        Series(
+            "light",
+            "Strong light",
+            "% of the pixels saturated",
+            (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0),
+            views,
+            stand.in_light,
+        ),
+        Series(
+            "chips",
+            "Chips and drops",
+            "of each on the part",
+            (0.0, 10.0, 20.0, 40.0, 80.0),
+            views,
+            stand.among_chips,
+        ),
+        Series(
+            "fixture",
+            "Table and clamps",
+            "clamps",
+            (0.0, 1.0, 2.0, 3.0, 4.0),
+            views,
+            stand.in_fixture,
+        ),
+        Series(
+            "casting",
+            "Casting allowance",
+            "mm",
+            (0.0, 0.25, 0.5, 0.75, 1.0),
+            views,
+            stand.as_cast,
+        ),
+        Series(
+            "stock",
+            "The same, stock estimated",
+            "mm",
+            (0.0, 0.25, 0.5, 0.75, 1.0),
+            views,
+            stand.as_cast,
+            max_allowance_mm=1.0,
+        ),
+        Series(
+            "noise",
+            "Correlated noise",
+            "px of disparity",
+            (0.0, 0.02, 0.05, 0.1, 0.2),
+            views,
+            stand.with_noise,
+        ),
+    ]
+
+
+class _Stand:
+    """The part, the kind of camera, and how each disturbance changes a scan."""
+
+    def __init__(self, part: Part, sensor: Sensor, seed: int) -> None:
+        self.part, self.sensor, self.seed = part, sensor, seed
+        self.scanner = Scanner(part)
+
+    def at_distance(self, distance_mm: float, number: int) -> Disturbed:
+        rng = self._rng(0, number)
+        return self._scan(rng, self._pose(rng, distance_mm=distance_mm), distance_mm=distance_mm)
+
+    def at_angle(self, azimuth_deg: float, number: int) -> Disturbed:
+        rng = self._rng(1, number, round(azimuth_deg))
+        views = hemisphere_viewpoints(
+            self.part.center,
+            distance_mm=DISTANCE_MM,
+            elevations_deg=(ELEVATION_DEG,),
+            azimuths_deg=(azimuth_deg,),
+        )
+        return self._scan(rng, views.view(0))
+
+    def in_light(self, percent: float, number: int) -> Disturbed:
+        rng = self._rng(2, number)
+        pose = self._pose(rng)
+        sensor = saturating(
+            self.scanner, self.sensor.another(rng), pose, percent / 100, seed=self.seed
+        )
+        return self._scan(rng, pose, sensor=sensor)
+
+    def among_chips(self, count: float, number: int) -> Disturbed:
+        return self._cluttered(self._rng(3, number), Clutter(chips=int(count), drops=int(count)))
+
+    def in_fixture(self, count: float, number: int) -> Disturbed:
+        rng = self._rng(4, number)
+        return self._cluttered(rng, Clutter(table=True, tilt_deg=3.0, clamps=int(count)))
+
+    def as_cast(self, allowance_mm: float, number: int) -> Disturbed:
+        rng = self._rng(5, number)
+        pose = self._pose(rng)
+        casting = Casting(
+            allowance_mm=allowance_mm / 2, waviness_mm=allowance_mm / 6, wavelength_mm=30.0
+        )
+        return self._scan(rng, pose, scanner=Scanner(as_cast(self.part, casting, rng)))
+
+    def with_noise(self, pixels: float, number: int) -> Disturbed:
+        rng = self._rng(6, number)
+        pose = self._pose(rng)
+        sensor = dataclasses.replace(
+            self.sensor.another(rng), correlated_px=pixels, correlation_px=40.0
+        )
+        return self._scan(rng, pose, sensor=sensor)
+
+    def _rng(self, *numbers: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, *numbers])
+
+    def _pose(
+        self, rng: np.random.Generator, *, distance_mm: float = DISTANCE_MM
+    ) -> RigidTransform:
+        """A random one of the paper's heights, turned as it happens."""
+        views = RandomViews(
+            distance_mm=(distance_mm, distance_mm), elevation_deg=(60.0, 85.0), aside=0.02
+        )
+        return views.draw(rng, self.part.center)
+
+    def _cluttered(self, rng: np.random.Generator, clutter: Clutter) -> Disturbed:
+        pose = self._pose(rng)
+        scene = clutter_scene(self.part, clutter, rng)
+        measured = measure(scene.scanner(), self.sensor.another(rng), pose, rng)
+        points = measured.points.astype(np.float64)
+        part = segment(points, self.part, sensor_origin=np.zeros(3)).part
+        foreign = scene.owner(measured.face)[part] > 0
+        return Disturbed(points[part], pose.inverse(), measured, float(foreign.mean()))
+
+    def _scan(
+        self,
+        rng: np.random.Generator,
+        pose: RigidTransform,
+        *,
+        sensor: Sensor | None = None,
+        scanner: Scanner | None = None,
+        distance_mm: float = DISTANCE_MM,
+    ) -> Disturbed:
+        sensor = sensor or self.sensor.another(rng).exposed_for(distance_mm)
+        measured = measure(scanner or self.scanner, sensor, pose, rng)
+        return Disturbed(measured.points.astype(np.float64), pose.inverse(), measured, 0.0)
+
+
+def saturating(
+    scanner: Scanner, sensor: Sensor, pose: RigidTransform, share: float, *, seed: int
+) -> Sensor:
+    """The sensor with the exposure time at which that share of its pixels saturates.
+
+    This is how the paper makes holes (section III.E): exposure alone. 0 leaves it as it is. Found
+    by bisection at a quarter of the pixels per side.
+    """
+    if share <= 0:
+        return sensor
+
+    def exposed(stops: float) -> Sensor:
+        exposure = dataclasses.replace(
+            sensor.exposure, exposure_ms=sensor.exposure.exposure_ms * 2.0**stops
+        )
+        return dataclasses.replace(sensor, exposure=exposure)
+
+    @functools.cache
+    def saturated(stops: float) -> float:
+        small = exposed(stops).scaled(0.25)
+        reason = measure(scanner, small, pose, np.random.default_rng(seed)).reason
+        return float(np.mean(reason == Reason.SATURATED))
+
+    low, high = -MOST_STOPS, MOST_STOPS
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if saturated(middle) < share else (low, middle)
+    return exposed(high)

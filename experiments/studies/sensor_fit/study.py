@@ -1,0 +1,351 @@
+"""How alike virtual and real scans are, effect by effect, and a sensor fitted to the real ones.
+
+python -m experiments.sensor_fit FOLDER [--out DIR] [--fit]
+
+FOLDER is that of `experiments.real_scans`. Every real scan is compared with what the CAD model
+predicts at its refined true pose; so are virtual scans of the same part in the same pose, by an
+ideal camera, with one effect of `vanejax.scanner.sensor.consumer_depth` alone, with all and with
+all but
+one. ``--fit`` searches the values of that preset on every other scan and prints them. Results: a
+table, sensor_fit.json and real_scans.png in ``--out``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.optimize import minimize
+
+from experiments.runner import study_command as study
+from experiments.studies.real_scans.study import load_truth
+from experiments.studies.sensor_fit.sensor_statistics import (
+    EDGE_PX,
+    Compared,
+    Grid,
+    compared,
+    distance,
+    find_grid,
+    residual_gap,
+    statistics,
+)
+from vanejax.cad.part import load_part
+from vanejax.cad.surface import Surface
+from vanejax.localization.residuals import RayCasting
+from vanejax.plotting.canvas import FAINT, INK, REFERENCE_RED, new_figure, save_figure, style_chart
+from vanejax.rigid import RigidTransform
+from vanejax.scanner import measurement
+from vanejax.scanner.camera import Camera, field_of_view_deg
+from vanejax.scanner.sensor import Sensor, consumer_depth
+from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scans.scan_file import load_scan
+
+FOCAL_PX = (150.0, 300.0)  # between which that of the real camera is sought
+WIDTH, HEIGHT = 424, 240
+EFFECTS: dict[str, tuple[str, ...]] = {
+    "noise": ("noise_px",),
+    "correlated": ("correlated_px",),
+    "window": ("window_px", "adhesion_px"),
+    "mixed": ("mixed_share",),
+    "steps": ("step_mm",),
+    "dropout": (
+        "shadow",
+        "most_incidence_deg",
+        "incidence_spread_deg",
+        "rim_px",
+        "lost_share",
+    ),
+}
+START = {
+    "noise_px": 0.01,
+    "correlated_px": 0.06,
+    "correlation_px": 10.0,
+    "window_px": 2.0,
+    "adhesion_px": 1.5,
+    "rim_px": 1.0,
+    "mixed_share": 0.5,
+    "jump_mm": 8.0,
+    "lost_share": 0.015,
+    "incidence_spread_deg": 8.0,
+    "most_incidence_deg": 77.0,
+}
+"""Where the search begins: guessed from the pictures of the residuals."""
+SHOWN = ("Separator_2", "Range_Hood_4")
+"""In the picture: two that the preset was not fitted to."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RealScan:
+    """One scan, its part, and about where the part stood.
+
+    Attributes:
+      name: the file's stem.
+      model: rays from the origin of the scan's frame.
+      camera_from_part: one right answer; a symmetric part has more.
+      points: [N, 3] f64 mm, camera frame.
+    """
+
+    name: str
+    model: RayCasting
+    camera_from_part: RigidTransform
+    points: np.ndarray
+
+
+def load(folder: Path) -> list[RealScan]:
+    """The scans of a folder.
+
+    Raises:
+      InputError: as `load_truth`, or a file that cannot be read.
+    """
+
+    @functools.cache
+    def model(cad: Path, units: str) -> RayCasting:
+        part = load_part(cad, units=units)
+        return RayCasting(Scanner(part), Surface(part), np.zeros(3))
+
+    scans = []
+    for known in load_truth(folder):
+        of = model(known.cad, known.cad_units)
+        scan = load_scan(known.scan, units=known.scan_units, part_extent_mm=of.part.extent_mm)
+        pose = RigidTransform.from_matrix(known.camera_from_part[0])
+        scans.append(RealScan(known.scan.stem, of, pose, scan.points))
+    return scans
+
+
+def camera(grid: Grid) -> Camera:
+    """One with the pixels of the grid, and the optical axis in its middle."""
+    return Camera(
+        width=WIDTH,
+        height=HEIGHT,
+        fov_x_deg=field_of_view_deg(WIDTH, grid.focal_px),
+        fov_y_deg=field_of_view_deg(HEIGHT, grid.focal_px),
+        near_mm=50.0,
+    )
+
+
+def measured_by(scans: Sequence[RealScan], sensor: Sensor, seed: int) -> list[Compared]:
+    """The same parts in the same poses, scanned by a sensor and compared as the real ones are."""
+    grid = Grid(sensor.camera.fx, 0.5, 0.5)  # the middle of an even number of pixels
+    result = []
+    for number, scan in enumerate(scans):
+        rng = np.random.default_rng([seed, number])
+        taken = measurement.measure(scan.model.scanner, sensor, scan.camera_from_part, rng)
+        points = taken.points.astype(np.float64)
+        result.append(compared(scan.model, points, scan.camera_from_part, grid))
+    return result
+
+
+def alone(full: Sensor, effect: str) -> Sensor:
+    """An ideal camera with one effect of a sensor."""
+    ideal = Sensor(
+        camera=full.camera,
+        baseline_mm=full.baseline_mm,
+        jump_mm=full.jump_mm,
+        correlation_px=full.correlation_px,
+    )
+    return dataclasses.replace(ideal, **{name: getattr(full, name) for name in EFFECTS[effect]})
+
+
+def without(full: Sensor, effect: str) -> Sensor:
+    """A sensor less one of its effects."""
+    return dataclasses.replace(full, **{name: getattr(Sensor(), name) for name in EFFECTS[effect]})
+
+
+def with_values(sensor: Sensor, values: Mapping[str, float]) -> Sensor:
+    """The sensor with other magnitudes, each held within what a sensor can have."""
+    bounds = {
+        "correlation_px": (1.0, 100.0),
+        "mixed_share": (0.0, 1.0),
+        "lost_share": (0.0, 1.0),
+        "most_incidence_deg": (30.0, 90.0),
+    }
+    limited = {
+        name: float(np.clip(value, *bounds.get(name, (0.0, 100.0))))
+        for name, value in values.items()
+    }
+    return dataclasses.replace(sensor, **limited)
+
+
+def fit(
+    unlike: Callable[[Sensor], float], sensor: Sensor, start: Mapping[str, float], *, steps: int
+) -> Sensor:
+    """The values in place of ``start`` for which ``unlike`` is smallest, by Nelder and Mead.
+
+    Over the values' logarithms, twice: the second search begins where the first ended, with a new
+    simplex, as the first one's tends to collapse. ``unlike`` must use the same random numbers at
+    every call, so that it is a function. At most ``steps`` calls in all.
+    """
+    names = list(start)
+
+    def there(place: np.ndarray) -> Sensor:
+        return with_values(sensor, dict(zip(names, np.exp(place), strict=True)))
+
+    best = np.log(list(start.values()))
+    sizes = np.diag([-0.06 if name == "most_incidence_deg" else 0.4 for name in names])
+    for size in (sizes, -sizes):
+        best = minimize(
+            lambda place: unlike(there(place)),
+            best,
+            method="Nelder-Mead",
+            options={
+                "maxfev": steps // 2,
+                "initial_simplex": np.vstack([best, best + size]),
+                "adaptive": True,  # to the number of values: without it ten are too many
+            },
+        ).x
+    return there(best)
+
+
+def halves(items: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+    """Every other one, and the rest: to fit, and to test the fit."""
+    return list(items[0::2]), list(items[1::2])
+
+
+def measure(
+    scans: Sequence[RealScan], real: Sequence[Compared], full: Sensor, seed: int
+) -> tuple[dict[str, Any], dict[str, list[Compared]]]:
+    """Figures of the real scans and of virtual ones, how far apart they are, and the scans.
+
+    Distances are to the real scans: of all, and of those half of them that were not fitted to.
+    """
+    ideal = dataclasses.replace(Sensor(), camera=full.camera)
+    made = {"ideal": measured_by(scans, ideal, seed)}
+    for effect in EFFECTS:
+        made[f"+ {effect}"] = measured_by(scans, alone(full, effect), seed)
+    made["all"] = measured_by(scans, full, seed)
+    for effect in EFFECTS:
+        made[f"all but {effect}"] = measured_by(scans, without(full, effect), seed)
+    of_all = statistics(real)
+    fitted, held_out = halves(real)
+    of_fitted, of_held_out = statistics(fitted), statistics(held_out)
+    rows = {}
+    for name, virtual in made.items():
+        figures = statistics(virtual)
+        rows[name] = {
+            "statistics": figures,
+            "distance": distance(of_all, figures),
+            "distance_held_out": distance(of_held_out, statistics(halves(virtual)[1])),
+            "residual_gap": residual_gap(real, virtual),
+        }
+    report = {
+        "scans": [scan.name for scan in scans],
+        "fitted_to": [scan.name for scan in halves(scans)[0]],
+        "real": {
+            "statistics": of_all,
+            "distance_of_halves": distance(of_fitted, of_held_out),
+            "residual_gap_of_halves": residual_gap(fitted, held_out),
+        },
+        "virtual": rows,
+    }
+    return report, {"real": list(real), **made}
+
+
+def table(report: Mapping[str, Any]) -> str:
+    """Figures of real and virtual scans side by side, as Markdown; then the distances."""
+    virtual = report["virtual"]
+    shown = [name for name in virtual if not name.startswith("all but")]
+    lines = [
+        "| figure | real | " + " | ".join(shown) + " |",
+        "|---|---|" + "---|" * len(shown),
+    ]
+    for figure, value in report["real"]["statistics"].items():
+        cells = [value, *(virtual[name]["statistics"][figure] for name in shown)]
+        lines.append(f"| {figure} | " + " | ".join(_cell(figure, cell) for cell in cells) + " |")
+    for title, key, halves_key in (
+        ("**distance, all scans**", "distance", "distance_of_halves"),
+        ("**distance, scans not fitted to**", "distance_held_out", None),
+        ("**Kolmogorov-Smirnov, residuals**", "residual_gap", "residual_gap_of_halves"),
+    ):
+        halves_cell = f"(halves: {report['real'][halves_key]:.2f})" if halves_key else ""
+        cells = [f"{virtual[name][key]:.2f}" for name in shown]
+        lines.append(f"| {title} | {halves_cell} | " + " | ".join(cells) + " |")
+    left = ", ".join(
+        f"{name.removeprefix('all but ')} {row['distance']:.2f}"
+        for name, row in virtual.items()
+        if name.startswith("all but")
+    )
+    lines += ["", f"The distance with all effects but one: {left}."]
+    return "\n".join(lines)
+
+
+def _cell(figure: str, value: float | None) -> str:
+    if value is None or not np.isfinite(value):
+        return "-"
+    return f"{value:.1%}" if figure.endswith("(share)") else f"{value:.2f}"
+
+
+def picture(scans: Sequence[RealScan], taken: Mapping[str, Sequence[Compared]]) -> Figure:
+    """Two scans: residuals in the image, real and virtual, and how they are distributed."""
+    columns = {"real": "real", "ideal": "virtual, ideal", "all": "virtual, consumer_depth"}
+    names = [scan.name for scan in scans]
+    chosen = [names.index(name) for name in SHOWN if name in names] or [0]
+    figure = new_figure(14.0, 3.2 * len(chosen))
+    panels = figure.subplots(len(chosen), 4, squeeze=False)
+    for row, number in zip(panels, chosen, strict=True):
+        for axes, (key, title) in zip(row, columns.items(), strict=False):
+            image = axes.imshow(taken[key][number].residual_mm, cmap="RdBu_r", vmin=-4, vmax=4)
+            axes.set_title(f"{names[number]}: {title}", color=INK, fontsize=10, loc="left")
+            axes.set_xticks([])
+            axes.set_yticks([])
+        figure.colorbar(image, ax=row[2], label="measured - predicted (mm)", shrink=0.8)
+        style_chart(row[3], title="away from edges", xlabel="residual (mm)", ylabel="share per mm")
+        for key, color in (("real", INK), ("all", REFERENCE_RED), ("ideal", FAINT)):
+            scan = taken[key][number]
+            inner = scan.residual_mm[scan.edge_px > EDGE_PX]
+            row[3].hist(
+                inner[np.isfinite(inner)],
+                bins=np.arange(-6, 6.1, 0.25),
+                density=True,
+                histtype="step",
+                color=color,
+                label=columns[key],
+                linewidth=1.5,
+            )
+        row[3].set_yscale("log")
+        row[3].set_ylim(1e-3, 60)
+        row[3].legend(frameon=False, fontsize=8, labelcolor=INK, loc="upper left")
+    return figure
+
+
+def main(settings: argparse.Namespace) -> dict[str, Any]:
+    """The comparison, after a fit if that is wanted."""
+    scans = load(settings.folder)
+    grid = find_grid([scan.points for scan in scans], lowest_px=FOCAL_PX[0], highest_px=FOCAL_PX[1])
+    real = [compared(scan.model, scan.points, scan.camera_from_part, grid) for scan in scans]
+    full = dataclasses.replace(consumer_depth(), camera=camera(grid))
+    if settings.fit:
+        some, wanted = halves(scans)[0], statistics(halves(real)[0])
+
+        def unlike(sensor: Sensor) -> float:
+            taken = measured_by(some * 2, sensor, settings.seed)  # each twice, to average chance
+            return distance(wanted, statistics(taken))
+
+        full = fit(unlike, full, START, steps=settings.steps)
+        print("\n".join(f"{name}={getattr(full, name):.3g}" for name in START))
+    # other random numbers than the search had
+    figures, taken = measure(scans, real, full, settings.seed + 1)
+    values = {name: getattr(full, name) for effect in EFFECTS.values() for name in effect}
+    head = study.header("statistics of residuals at the refined true pose", settings)
+    report = head | {
+        "grid": dataclasses.asdict(grid),
+        "sensor": values | {"correlation_px": full.correlation_px},
+    }
+    report = study.save(settings.out, "sensor_fit", report | figures)
+    save_figure(picture(scans, taken), settings.out / "real_scans.png", dpi=110)
+    print(table(report))
+    return report
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's arguments."""
+    parser = study.make_parser("sensor_fit", __doc__)
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of experiments.real_scans")
+    parser.add_argument("--fit", action="store_true", help="search the values first")
+    parser.add_argument("--steps", type=study.count, default=600, help="of the search (600)")
+    return parser

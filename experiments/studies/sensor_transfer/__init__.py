@@ -1,0 +1,1 @@
+"""What a network trained on virtual scans is worth on real ones."""

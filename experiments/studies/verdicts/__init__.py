@@ -1,0 +1,1 @@
+"""How well the verdict tells right poses from wrong ones, over parts and sensors."""

@@ -1,0 +1,193 @@
+"""Scans of a part by the kinds of sensor that verdicts are tried on, and what lies in the way.
+
+Noise, bias and holes are those of `vanejax.scanner.sensor`. What is added here is what a sensor
+cannot
+know: patches and a side of the part that something hides from the depth camera, and a table or a
+clamp beside the part.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from vanejax.cad.part import Part
+from vanejax.errors import InputError
+from vanejax.rigid import RigidTransform
+from vanejax.scanner import measurement
+from vanejax.scanner.camera import Camera
+from vanejax.scanner.sensor import Sensor, consumer_depth, paper_camera
+from vanejax.scanner.virtual_scanner import Scanner
+
+KINDS = ("structured_light", "depth_camera", "clutter")
+HOLES = (1, 5)  # round ones, in scans of the depth camera
+HOLE_PX = (2.0, 7.0)
+CROPPED_SHARE = (0.0, 0.15)  # of its points, lost at one side of the part
+CLUTTER_SHARE = (0.1, 0.2)  # of the points of a scan with a table or a clamp
+
+
+def sensor(kind: str) -> Sensor:
+    """The sensor of a kind, one of `KINDS`.
+
+    Structured light is the paper's camera with half the pixels per side, which may stand nearer.
+
+    Raises:
+      InputError: no such kind.
+    """
+    if kind not in KINDS:
+        raise InputError(f"no sensor kind {kind!r}; there are {', '.join(KINDS)}")
+    if kind == "depth_camera":
+        return consumer_depth()
+    coarse = paper_camera().scaled(0.5)
+    return dataclasses.replace(coarse, camera=dataclasses.replace(coarse.camera, near_mm=50.0))
+
+
+def random_pose(rng: np.random.Generator, part: Part, distance_mm: float) -> RigidTransform:
+    """camera_from_part: uniformly random in SO(3), the part's centre ``distance_mm`` away.
+
+    The centre lies up to 3 % of the distance off the optical axis, in x and in y.
+
+    Raises:
+      InputError: the camera would stand inside the part's sphere.
+    """
+    if not part.radius < distance_mm < math.inf:
+        raise InputError(
+            f"a camera {distance_mm!r} mm from the centre of {part.name} is not outside of it; "
+            f"its radius is {part.radius:.1f} mm"
+        )
+    rotation = Rotation.random(rng=rng).as_matrix()
+    aside = rng.uniform(-0.03, 0.03, 2) * distance_mm
+    center = np.array([aside[0], aside[1], -distance_mm])
+    return RigidTransform(rotation, center - rotation @ part.center)
+
+
+def measure(
+    part: Part, scanner: Scanner, camera_from_part: RigidTransform, *, kind: str, seed: int
+) -> np.ndarray:
+    """One scan of the part by a sensor, exposed for its distance.
+
+    Args:
+      part: what is scanned.
+      scanner: of that part.
+      camera_from_part: the pose, such as `random_pose` gives.
+      kind: one of `KINDS`; "clutter" is structured light with a table or a clamp in the view.
+      seed: of all errors; the same arguments give the same points.
+
+    Returns:
+      points [N, 3] f64, mm, camera frame (looking along -z), in pixel order.
+
+    Raises:
+      InputError: no such kind, or nothing of the part is measured.
+    """
+    used = sensor(kind).exposed_for(-float(camera_from_part.apply(part.center[None])[0, 2]))
+    rng = np.random.default_rng([seed, KINDS.index(kind)])
+    taken = measurement.measure(scanner, used, camera_from_part, rng)
+    images = taken.organised()
+    points = images["points"].astype(np.float64)
+    depth = -points[..., 2]
+    if kind == "depth_camera":
+        _drop_holes(depth, rng)
+        _crop(depth, rng.uniform(*CROPPED_SHARE), rng)
+    if kind == "clutter" and len(taken.points):
+        share = rng.uniform(*CLUTTER_SHARE)
+        if rng.random() < 0.5:
+            covered = images["reason"] != measurement.Reason.NOTHING
+            vertices = camera_from_part.apply(part.mesh.vertices)
+            whole = _table(used, depth, covered, vertices, share, rng)
+        else:
+            whole = _clamp(used, depth, share, rng)
+        foreign = np.isfinite(whole) & (whole != depth)
+        rows, columns = np.nonzero(foreign)
+        x, y = used.camera.slopes(columns, rows)
+        points[foreign] = whole[foreign][:, None] * np.stack([x, y, np.full_like(x, -1.0)], -1)
+        depth = whole
+    points = points[np.isfinite(depth)]
+    if not len(points):
+        raise InputError(f"no point of {part.name} is measured from this pose")
+    return points
+
+
+def _drop_holes(depth: np.ndarray, rng: np.random.Generator) -> None:
+    """Round patches around random measured pixels become NaN, in place."""
+    for _ in range(rng.integers(HOLES[0], HOLES[1] + 1)):
+        places = np.argwhere(np.isfinite(depth))
+        if not len(places):
+            return
+        middle = places[rng.integers(len(places))]
+        rows, columns = np.ogrid[: depth.shape[0], : depth.shape[1]]
+        radius = rng.uniform(*HOLE_PX)
+        depth[(rows - middle[0]) ** 2 + (columns - middle[1]) ** 2 < radius**2] = np.nan
+
+
+def _crop(depth: np.ndarray, share: float, rng: np.random.Generator) -> None:
+    """That share of the measured pixels, farthest to a random side, becomes NaN, in place."""
+    angle = rng.uniform(0, 2 * math.pi)
+    rows, columns = np.nonzero(np.isfinite(depth))
+    order = np.argsort(rows * math.sin(angle) + columns * math.cos(angle), kind="stable")
+    lost = order[: int(share * len(order))]
+    depth[rows[lost], columns[lost]] = np.nan
+
+
+def _plane_depth(camera: Camera, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """[height, width]: depth of a plane along each pixel's ray; NaN behind the camera."""
+    x, y = camera.slopes(np.arange(camera.width), np.arange(camera.height)[:, None])
+    closing = normal[0] * x + normal[1] * y - normal[2]
+    depth = np.dot(normal, point) / np.where(closing == 0, np.nan, closing)
+    return np.where((depth > camera.near_mm) & (depth < camera.far_mm), depth, np.nan)
+
+
+def _count(measured: np.ndarray, share: float) -> int:
+    """How many points make up that share of the scan when added to the measured ones."""
+    return round(share / (1 - share) * np.count_nonzero(np.isfinite(measured)))
+
+
+def _table(
+    sensor: Sensor,
+    depth: np.ndarray,
+    covered: np.ndarray,
+    vertices: np.ndarray,
+    share: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """The part lies on a plane that is seen, in a patch, where the part does not hide it."""
+    normal = rng.standard_normal(3)
+    normal[2] = 1 + abs(normal[2])  # at most some 55 deg from the viewing direction
+    normal /= np.linalg.norm(normal)
+    foot = vertices[np.argmin(vertices @ normal)]
+    plane = _plane_depth(sensor.camera, foot, normal)
+    plane += sensor.range_sigma_mm(plane) * rng.standard_normal(plane.shape)
+    # nor beside it, where its points would hardly be foreign
+    plane[ndimage.binary_dilation(covered, iterations=2)] = np.nan
+    rows, columns = np.nonzero(np.isfinite(plane))
+    there = np.argwhere(np.isfinite(depth))
+    middle = there[rng.integers(len(there))]
+    order = np.argsort(np.hypot(rows - middle[0], columns - middle[1]), kind="stable")
+    seen = order[: _count(depth, share)]
+    result = depth.copy()
+    result[rows[seen], columns[seen]] = plane[rows[seen], columns[seen]]
+    return result
+
+
+def _clamp(sensor: Sensor, depth: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
+    """A jaw of a few mm before the part, square in the image, across a place of its outline."""
+    measured = np.isfinite(depth)
+    outline = np.argwhere(measured & ~ndimage.binary_erosion(measured))
+    row, column = outline[rng.integers(len(outline))]
+    x, y = sensor.camera.slopes(column, row)
+    front = depth[row, column] - rng.uniform(4, 12)
+    tilt = np.append(rng.uniform(-0.3, 0.3, 2), 1.0)
+    plane = _plane_depth(sensor.camera, front * np.array([x, y, -1.0]), tilt)
+    plane += sensor.range_sigma_mm(plane) * rng.standard_normal(plane.shape)
+    rows, columns = np.ogrid[: depth.shape[0], : depth.shape[1]]
+    square = np.maximum(np.abs(rows - row), np.abs(columns - column))
+    seen = np.isfinite(plane) & ~(depth < plane)
+    # what the jaw hides is lost, so its half width is found by trying
+    for half in range(1, max(depth.shape)):
+        jaw = (square <= half) & seen
+        if np.count_nonzero(jaw) >= share * np.count_nonzero(jaw | measured):
+            break
+    return np.where(jaw, plane, depth)

@@ -1,0 +1,239 @@
+"""Symmetries of parts: exact ones by name, near ones by search, and pose errors modulo both.
+
+Every symmetry is a proper rigid motion of the part's own frame, [4, 4] f64 in mm, that maps the
+surface to itself. A pose part_from_camera is then as right as ``symmetry @ part_from_camera``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from vanejax.cad.part import Part
+from vanejax.rigid import RigidTransform
+
+Axis = tuple[np.ndarray, np.ndarray]
+
+SURFACE_SAMPLES, SAMPLES_PER_QUERY = 60_000, 3
+SCREENED_POINTS, POLISHED_POINTS, SCORED_POINTS = 150, 400, 2000
+POLISHING_STEPS = 6
+SAME_TURN_DEG, SAME_SHIFT = 10.0, 0.1  # of the radius: what counts as one near symmetry
+
+
+def rotation_about(axis: np.ndarray, angle_deg: float, point: np.ndarray) -> np.ndarray:
+    """[4, 4]: right-handed turn about the line through ``point`` [3] along ``axis`` [3]."""
+    axis = np.asarray(axis, np.float64)
+    turn = Rotation.from_rotvec(math.radians(angle_deg) * axis / np.linalg.norm(axis)).as_matrix()
+    return motion(turn, np.asarray(point, np.float64) - turn @ np.asarray(point, np.float64))
+
+
+def motion(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """[4, 4] from [3, 3] and [3]."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    return matrix
+
+
+def cyclic(order: int, axis: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """The group C_n [n, 4, 4]: turns by 360/n deg about a line; the identity comes first."""
+    return np.stack([rotation_about(axis, 360 * i / order, point) for i in range(order)])
+
+
+def dihedral(order: int, axis: np.ndarray, flip: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """The group D_n [2n, 4, 4]: C_n about ``axis``, and half turns like that about ``flip``."""
+    turns = cyclic(order, axis, point)
+    return np.concatenate([turns, turns @ rotation_about(flip, 180, point)])
+
+
+class Surface:
+    """Distances to a part's surface by dense samples that stand for small discs.
+
+    A sample counts as a disc of its normal with as much radius as samples are apart, so a part's
+    exact symmetries give no more than the sag of its facets; the price is that an edge seems to
+    reach that much (0.3 to 0.6 mm) farther. The exact distance to the triangles (closest of all)
+    would take a spatial tree of triangles, which no dependency has.
+    """
+
+    def __init__(self, part: Part) -> None:
+        self.part = part
+        self._points, self._normals, _ = part.sample(SURFACE_SAMPLES, seed=0)
+        self._spacing_mm = math.sqrt(part.mesh.area / SURFACE_SAMPLES)
+        self._tree = cKDTree(self._points)
+
+    def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nearest samples [N, 3] of points [N, 3] mm, distances to the discs [N], normals."""
+        _, sample = self._tree.query(points, k=SAMPLES_PER_QUERY)
+        offset = points[:, None] - self._points[sample]
+        height = np.einsum("nki,nki->nk", offset, self._normals[sample])
+        aside = np.sqrt(np.maximum(np.einsum("nki,nki->nk", offset, offset) - height**2, 0))
+        distance = np.hypot(height, np.maximum(aside - 1.5 * self._spacing_mm, 0))
+        best = sample[np.arange(len(points)), np.argmin(distance, axis=1)]
+        return self._points[best], distance.min(axis=1), self._normals[best]
+
+    def mismatch_mm(self, matrix: np.ndarray, count: int = SCORED_POINTS) -> float:
+        """Symmetric mean distance of the surface and its image under ``matrix`` [4, 4]."""
+        points, _, _ = self.part.sample(count, seed=1)
+        transform = RigidTransform.from_matrix(matrix)
+        there, back = transform.apply(points), transform.inverse().apply(points)
+        return float(np.mean(self.nearest(np.concatenate([there, back]))[1]))
+
+    def polish(self, matrix: np.ndarray) -> np.ndarray:
+        """[4, 4]: point-to-plane ICP of the surface to itself, started at ``matrix``."""
+        points, _, _ = self.part.sample(POLISHED_POINTS, seed=2)
+        for _ in range(POLISHING_STEPS):
+            moved = RigidTransform.from_matrix(matrix).apply(points)
+            target, _, normals = self.nearest(moved)
+            middle = moved.mean(axis=0)
+            # rotations count as the distances they move, so that the six columns compare
+            lever = np.cross((moved - middle) / self.part.radius, normals)
+            jacobian = np.concatenate([lever, normals], axis=1)
+            residual = np.sum(normals * (target - moved), axis=1)
+            # the cut-off keeps still what the surface does not hold, as a turned part's angle
+            step = np.linalg.lstsq(jacobian, residual, rcond=1e-2)[0]
+            turn = Rotation.from_rotvec(step[:3] / self.part.radius).as_matrix()
+            matrix = motion(turn, middle - turn @ middle + step[3:]) @ matrix
+        return matrix
+
+
+def candidates(part: Part) -> np.ndarray:
+    """Rotations [K, 4, 4] about the surface's centroid among which near symmetries are sought.
+
+    Multiples of 15 deg about the part's and the surface's principal axes, alone and after a half
+    turn about another of these axes, and the 60 icosahedral rotations.
+    """
+    points, _, _ = part.sample(20_000, seed=0)
+    center = points.mean(axis=0)
+    _, principal = np.linalg.eigh(np.cov((points - center).T))
+    principal[:, 0] *= np.linalg.det(principal)
+    steps = np.arange(24) * (math.pi / 12)
+    turns = []
+    for frame in (np.eye(3), principal):
+        for i in range(3):
+            about = Rotation.from_rotvec(steps[:, None] * frame[:, i])
+            flip = Rotation.from_rotvec(math.pi * frame[:, (i + 1) % 3])
+            turns += [about.as_matrix(), (about * flip).as_matrix()]
+        turns.append(frame @ Rotation.create_group("I").as_matrix() @ frame.T)
+    rotations = _different(np.concatenate(turns))
+    return np.stack([motion(r, center - r @ center) for r in rotations])
+
+
+def _different(rotations: np.ndarray) -> np.ndarray:
+    """Those of [K, 3, 3] that are not within 1 deg of an earlier one."""
+    cosine = 0.5 * (np.einsum("aij,bij->ab", rotations, rotations) - 1)
+    same = cosine > math.cos(math.radians(1))
+    return rotations[[i for i in range(len(same)) if not same[i, :i].any()]]
+
+
+def near_symmetries(
+    part: Part,
+    symmetries: np.ndarray,
+    *,
+    continuous_axis: Axis | None = None,
+    largest_share: float = 0.02,
+    more: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motions that nearly map the part to itself, found numerically.
+
+    They are local minima of the mismatch. Of the motions that differ by an exact symmetry only
+    (`pose_error` tells no difference) one is listed; where the part is nearly turned, one every
+    15 deg or so.
+
+    Args:
+      part: whose.
+      symmetries: [S, 4, 4], the exact ones, identity included.
+      continuous_axis: point and direction of an axis of exact continuous symmetry.
+      largest_share: of the part's radius, what the mean surface distance may reach.
+      more: [K, 4, 4] further motions to try.
+
+    Returns:
+      Motions [M, 4, 4] and their symmetric mean surface distances [M] in mm, ascending.
+    """
+    surface, limit = Surface(part), largest_share * part.radius
+    found: list[tuple[float, np.ndarray]] = []
+    tried: list[np.ndarray] = []
+
+    def is_new(matrix: np.ndarray, known: list[np.ndarray], angle_deg: float) -> bool:
+        errors = (
+            pose_error(
+                RigidTransform.from_matrix(matrix),
+                RigidTransform.from_matrix(other),
+                symmetries,
+                center=part.center,
+                radius_mm=part.radius,
+                continuous_axis=continuous_axis,
+            )
+            for other in known
+        )
+        return all(e[0] > angle_deg or e[1] > SAME_SHIFT * part.radius for e in errors)
+
+    def coarse(matrix: np.ndarray) -> float:
+        return surface.mismatch_mm(matrix, POLISHED_POINTS)
+
+    every = candidates(part) if more is None else np.concatenate([candidates(part), more])
+    for matrix in every:
+        # what is far off before the polish will not come near enough by it
+        if surface.mismatch_mm(matrix, SCREENED_POINTS) > 3 * limit:
+            continue
+        if not is_new(matrix, [np.eye(4), *tried], 1.0):
+            continue
+        tried.append(matrix)
+        matrix = min(matrix, surface.polish(matrix), key=coarse)
+        if coarse(matrix) > 1.5 * limit:
+            continue
+        if not is_new(matrix, [np.eye(4), *(m for _, m in found)], 1.0):
+            continue
+        # it may still be on its way to a better one
+        matrix = min(matrix, surface.polish(matrix), key=coarse)
+        distance = surface.mismatch_mm(matrix)
+        if distance < limit:
+            found.append((distance, matrix))
+    kept: list[tuple[float, np.ndarray]] = []
+    for distance, matrix in sorted(found, key=lambda pair: pair[0]):
+        if is_new(matrix, [np.eye(4), *(m for _, m in kept)], SAME_TURN_DEG):
+            kept.append((distance, matrix))
+    return np.array([m for _, m in kept]).reshape(-1, 4, 4), np.array([d for d, _ in kept])
+
+
+def pose_error(
+    found: RigidTransform,
+    truth: RigidTransform,
+    symmetries: np.ndarray,
+    *,
+    center: np.ndarray,
+    radius_mm: float,
+    continuous_axis: Axis | None = None,
+) -> tuple[float, float]:
+    """How far a pose is from the nearest of all right ones.
+
+    With E = found @ truth^-1, a motion of the part's frame, and a symmetry S, the error is
+    S^-1 E: its angle, and by how much it moves the part's centre. Of the symmetries that one
+    counts for which angle in radians times radius plus that distance is smallest. About a
+    continuous axis u the turn that leaves the smallest angle is taken out first: of the quaternion
+    (w, v) the twist 2 atan2(v.u, w).
+
+    Args:
+      found: part_from_camera, mm.
+      truth: part_from_camera, mm.
+      symmetries: [S, 4, 4] in the part's frame, identity included.
+      center: [3] mm, the part's centre in its frame.
+      radius_mm: the part's radius, to weigh angles against distances.
+      continuous_axis: point [3] and unit direction [3] in the part's frame, or None.
+
+    Returns:
+      rotation_deg in [0, 180], translation_mm at the centre.
+    """
+    error = (found @ truth.inverse()).as_matrix()
+    rest = np.linalg.inv(symmetries) @ error
+    if continuous_axis is not None:
+        point, direction = continuous_axis
+        quaternion = Rotation.from_matrix(rest[:, :3, :3]).as_quat()
+        twist = 2 * np.arctan2(quaternion[:, :3] @ direction, quaternion[:, 3])
+        back = [rotation_about(direction, angle, point) for angle in -np.degrees(twist)]
+        rest = np.stack(back) @ rest
+    angle = Rotation.from_matrix(rest[:, :3, :3]).magnitude()
+    shift = np.linalg.norm(rest[:, :3, :3] @ center + rest[:, :3, 3] - center[None], axis=-1)
+    best = np.argmin(angle * radius_mm + shift)
+    return math.degrees(angle[best]), float(shift[best])

@@ -1,0 +1,224 @@
+"""Castings: offsets on solids whose answer is known, the random field's law, and a scan's shift."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+
+from vanejax.cad.investment_casting import CUT, Casting, as_cast, waviness
+from vanejax.cad.parametric_vane import guide_vane
+from vanejax.cad.part import Part, part_from_mesh
+from vanejax.errors import InputError
+from vanejax.plotting.casting import casting_map
+from vanejax.scanner.camera import Camera, hemisphere_viewpoints
+from vanejax.scanner.virtual_scanner import Scanner
+
+NOTHING = Casting(allowance_mm=0, waviness_mm=0)
+STOCK = dataclasses.replace(NOTHING, allowance_mm=0.5)
+WAVES = Casting(allowance_mm=0, waviness_mm=0.2, wavelength_mm=40)
+CAMERA = Camera().scaled(0.15)
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng([7, seed])
+
+
+def box() -> Part:
+    mesh = trimesh.creation.box((60, 40, 20))
+    return part_from_mesh(mesh.vertices, mesh.faces, name="box")
+
+
+def bracket() -> Part:
+    """An L: one concave edge between two faces of 25 mm."""
+    flat = np.array([[0, 0], [30, 0], [30, 5], [5, 5], [5, 30], [0, 30]], float)
+    bottom, top = (np.column_stack([flat, np.full(6, z)]) for z in (0.0, 20.0))
+    lid = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    walls = [[i, (i + 1) % 6, (i + 1) % 6 + 6] for i in range(6)]
+    walls += [[i, (i + 1) % 6 + 6, i + 6] for i in range(6)]
+    faces = np.concatenate([lid[:, ::-1], lid + 6, np.array(walls)])
+    return part_from_mesh(np.concatenate([bottom, top]), faces, name="bracket")
+
+
+@pytest.fixture(scope="module")
+def vane() -> Part:
+    return guide_vane()
+
+
+# --- the offset -----------------------------------------------------------------------------------
+
+
+def test_a_casting_without_errors_is_the_part(vane):
+    assert as_cast(vane, NOTHING, rng()).sha256 == vane.sha256
+
+
+def test_stock_makes_a_sphere_larger():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=25)
+    cast = as_cast(part_from_mesh(ball.vertices, ball.faces, name="ball"), STOCK, rng())
+    radius = np.linalg.norm(cast.mesh.vertices, axis=1)
+    # the facets' planes stand 0.02 % of the offset nearer than the vertices, and the offset itself
+    # is good to one per mille
+    np.testing.assert_allclose(radius, 25.5, atol=1e-3)
+    assert cast.name == "ball as cast"
+
+
+@pytest.mark.parametrize("stock_mm", [0.5, -0.5])
+def test_stock_moves_the_faces_of_a_box(stock_mm):
+    cast = as_cast(box(), dataclasses.replace(STOCK, allowance_mm=stock_mm), rng())
+    np.testing.assert_allclose(cast.extent_mm, np.add([60, 40, 20], 2 * stock_mm), atol=1e-3)
+    assert cast.mesh.volume == pytest.approx(np.prod(cast.extent_mm), rel=1e-4)
+
+
+def test_stock_does_not_fold_a_concave_corner():
+    """With waviness of nearly nothing, so that vertices stand within the stock of the corner."""
+    casting = Casting(allowance_mm=1.0, waviness_mm=1e-6, wavelength_mm=2.5)
+    cast = as_cast(bracket(), casting, rng())
+    # as the L with each wall moved by 1 mm: 32 x 32 less 25 x 25, 22 high
+    assert cast.mesh.volume == pytest.approx((32 * 32 - 25 * 25) * 22, rel=1e-3)
+    # what is folded over counts three times here, and not at all in the volume
+    assert cast.mesh.area == pytest.approx(2 * (32 * 32 - 25 * 25) + 4 * 32 * 22, rel=1e-3)
+    assert cast.mesh.is_watertight
+
+
+def test_the_vanes_casting_is_closed_and_within_its_limits(vane):
+    casting = Casting()
+    assert casting.limits_mm == pytest.approx((0.05, 0.95))
+    cast = as_cast(vane, casting, rng())
+    assert cast.closed
+    assert cast.mesh.is_watertight
+    assert not cast.notes  # nothing had to be repaired
+    assert len(cast.mesh.faces) < 50_000
+    # along the normals, from outside, to the casting and to the CAD model under it
+    points, normals, face = cast.sample(4_000, 0)
+    origins = points + 5 * normals
+    back = Scanner(vane).cast(origins, -normals).distance_mm
+    direct = Scanner(cast).cast(origins, -normals)
+    free = (direct.face == face) & (back < 6.5)  # nothing in between, and the CAD model's face
+    offset = back[free] - 5
+    assert np.mean((offset > 0.03) & (offset < 0.97)) > 0.98  # the rest is beside an edge
+    # stock and two thirds of the surface within a standard deviation
+    assert np.median(offset) == pytest.approx(0.5, abs=0.15)
+
+
+def test_equal_generators_give_equal_bits():
+    one, two, other = (as_cast(box(), Casting(), rng(seed)) for seed in (0, 0, 1))
+    assert one.sha256 == two.sha256 != other.sha256
+    draws = rng()
+    first, second = (as_cast(box(), Casting(), draws) for _ in range(2))
+    assert first.sha256 == one.sha256 != second.sha256
+
+
+# --- the random field -----------------------------------------------------------------------------
+
+
+def test_the_waviness_has_the_deviation_and_the_correlation_asked_for():
+    """Over 300 draws, against ``sigma^2 exp(-r^2 / (2 l^2))``."""
+    steps = np.array([0.0, 20.0, 40.0, 80.0])
+    points = np.column_stack([steps, 0.6 * steps, np.zeros(4)])
+    draws = np.stack([waviness(points, WAVES, rng(seed)) for seed in range(300)])
+    covariance = draws.T @ draws / len(draws)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    expected = WAVES.waviness_mm**2 * np.exp(-((apart / WAVES.wavelength_mm) ** 2) / 2)
+    # an entry's own error is 0.06 to 0.08 of the variance: three and a half of these
+    np.testing.assert_allclose(covariance, expected, atol=0.27 * WAVES.waviness_mm**2)
+    np.testing.assert_allclose(np.diag(covariance).mean(), 0.04, rtol=0.15)
+    assert np.abs(draws.mean(axis=0)).max() < 4 * 0.2 / np.sqrt(300)
+
+
+def test_the_waviness_is_cut_off():
+    points = np.random.default_rng(0).uniform(-1000, 1000, (20_000, 3))
+    field = waviness(points, WAVES, rng())
+    assert np.abs(field).max() == pytest.approx(CUT * WAVES.waviness_mm)
+    assert 0.001 < np.mean(np.abs(field) >= CUT * WAVES.waviness_mm) < 0.01  # 0.27 % of a normal
+    assert field.std() == pytest.approx(0.2, rel=0.1)
+
+
+def test_the_mesh_follows_the_waviness():
+    """The cast box's top face against the field itself, between its vertices."""
+    cast = as_cast(box(), dataclasses.replace(WAVES, wavelength_mm=15), rng())
+    grid = np.stack(np.meshgrid(np.arange(-24.0, 25), np.arange(-14.0, 15)), -1).reshape(-1, 2)
+    above = np.column_stack([grid, np.full(len(grid), 30.0)])
+    hits = Scanner(cast).cast(above, np.tile([0.0, 0.0, -1.0], (len(above), 1)))
+    field_rng = rng().spawn(2)[0]
+    foot = np.column_stack([grid, np.full(len(grid), 10.0)])
+    field = waviness(foot, dataclasses.replace(WAVES, wavelength_mm=15), field_rng)
+    # a fifth of a correlation length between vertices misses 0.9 % of the deviation, and within
+    # 10 mm of an edge they give way to it by up to the offset, which is here sloped by 1 in 30
+    np.testing.assert_allclose(20 - hits.distance_mm, field, atol=0.06 * 0.2)
+
+
+# --- the bow --------------------------------------------------------------------------------------
+
+
+def test_the_bow_bends_the_middle_away_from_the_ends():
+    casting = dataclasses.replace(NOTHING, bow_mm=0.8)
+    cast = as_cast(box(), casting, rng())
+    corners = np.asarray(cast.mesh.vertices)
+    x = corners[:, 0]
+    ends = [corners[np.abs(x - side) < 1e-3].mean(axis=0) for side in (-30, 30)]
+    middle = np.abs(x).min()
+    bend = corners[np.abs(x) < middle + 1e-3].mean(axis=0) - np.mean(ends, axis=0)
+    assert np.linalg.norm(bend[1:]) == pytest.approx(0.8 * (1 - (middle / 30) ** 2), rel=0.02)
+    assert abs(bend[0]) < 1e-3
+    assert cast.mesh.is_watertight
+    waves = as_cast(box(), dataclasses.replace(WAVES, bow_mm=0), rng())
+    both = as_cast(box(), dataclasses.replace(WAVES, bow_mm=1e-6), rng())
+    np.testing.assert_allclose(both.mesh.bounds, waves.mesh.bounds, atol=0.01)
+
+
+# --- what the scanner sees ------------------------------------------------------------------------
+
+
+def test_a_scan_of_the_casting_lies_before_the_cads_by_the_offset(vane):
+    view = hemisphere_viewpoints(vane.center).view(40)
+    plain = Scanner(vane).scan(CAMERA, view)
+    cast = Scanner(as_cast(vane, STOCK, rng())).scan(CAMERA, view)
+    _, one, two = np.intersect1d(plain.pixel, cast.pixel, return_indices=True)
+    # the same face from both: not beside an edge
+    same = np.sum(plain.normals[one] * cast.normals[two], axis=1) > 0.9999
+    step = (cast.points[two] - plain.points[one])[same].astype(np.float64)
+    along = np.einsum("ni,ni->n", step, plain.normals[one][same].astype(np.float64))
+    assert same.mean() > 0.5
+    assert np.median(along) == pytest.approx(0.5, abs=2e-3)
+    assert np.mean(np.abs(along - 0.5) < 0.02) > 0.9
+
+
+def test_the_map_shows_the_offset(vane):
+    """Its colour bar spans what was asked for; a uniform one has a scale of its own."""
+    bar = casting_map(vane, as_cast(vane, STOCK, rng())).axes[-1]
+    low, high = bar.get_ylim()
+    assert low == pytest.approx(0.495, abs=0.01)
+    assert high == pytest.approx(0.505, abs=0.01)
+    waves = casting_map(box(), as_cast(box(), WAVES, rng())).axes[-1].get_ylim()
+    assert waves[0] == -waves[1]
+    assert 0.05 < waves[1] < 0.61
+
+
+# --- what cannot be cast --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"allowance_mm": np.nan}, "allowance_mm must be finite"),
+        ({"waviness_mm": -0.1}, "waviness_mm must be 0 mm or more"),
+        ({"bow_mm": -0.1}, "bow_mm must be 0 mm or more"),
+        ({"wavelength_mm": 0.0}, "wavelength_mm must be above 0 mm"),
+    ],
+)
+def test_settings_that_no_casting_can_have(wrong, message):
+    with pytest.raises(InputError, match=message):
+        Casting(**wrong)
+
+
+def test_a_wavelength_too_short_for_the_part_and_an_open_surface():
+    with pytest.raises(InputError, match="60 mm needs too many faces"):
+        as_cast(box(), Casting(wavelength_mm=0.5), rng())
+    solid = box()
+    sheet = part_from_mesh(
+        solid.mesh.vertices, solid.mesh.faces[:-2], name="sheet", must_be_closed=False
+    )
+    with pytest.raises(InputError, match="open surface"):
+        as_cast(sheet, Casting(), rng())

@@ -1,0 +1,356 @@
+"""Repairs: what is mended comes out as the solid it should have been, the rest is refused."""
+
+from __future__ import annotations
+
+import hypothesis
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import strategies as st
+
+from vanejax.cad import mesh_repair
+from vanejax.cad.mesh_repair import repair_solid
+from vanejax.cad.triangles import Edges, signed_volume
+from vanejax.errors import InputError
+
+
+def box(extents=(100.0, 50.0, 20.0), at=(0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+    mesh = trimesh.creation.box(extents)
+    mesh.apply_translation(at)
+    return mesh
+
+
+def ball(radius: float = 50.0, at=(0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+    mesh = trimesh.creation.icosphere(3, radius)
+    mesh.apply_translation(at)
+    return mesh
+
+
+def both(*meshes: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    mesh = trimesh.util.concatenate(list(meshes))
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def repaired(vertices, faces) -> tuple[trimesh.Trimesh, str]:
+    """The solid and its notes as one text; whatever went in, it is closed and outward."""
+    solid, notes = repair_solid(np.asarray(vertices), np.asarray(faces), name="part")
+    assert not np.any(Edges.of(solid.faces).net)
+    assert signed_volume(solid.corners()) > 0
+    return trimesh.Trimesh(solid.points, solid.faces, process=False), "; ".join(notes)
+
+
+def test_a_good_mesh_is_left_alone():
+    mesh, notes = repaired(ball().vertices, ball().faces)
+    assert notes == ""
+    assert mesh.is_watertight
+    assert len(mesh.faces) == len(ball().faces)
+
+
+def test_a_soup_of_triangles_is_welded():
+    soup = ball().triangles.reshape(-1, 3)
+    mesh, notes = repaired(soup, np.arange(len(soup)).reshape(-1, 3))
+    assert notes == ""
+    assert len(mesh.vertices) == len(ball().vertices)
+
+
+def test_inside_out_is_turned():
+    mesh, notes = repaired(ball().vertices, ball().faces[:, ::-1])
+    assert notes == "turned 1 inside-out body outward"
+    assert mesh.volume > 0
+
+
+def test_one_inside_out_body_of_two_is_turned():
+    far = box(at=(200, 0, 0))
+    far.invert()
+    mesh, notes = repaired(*both(box(), far))
+    assert "turned 1 inside-out body outward" in notes
+    assert "has 2 separate bodies" in notes
+    assert mesh.volume == pytest.approx(2e5, rel=1e-12)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_any_winding_is_mended(share):
+    mesh = ball()
+    flip = np.random.default_rng(1).random(len(mesh.faces)) < share
+    faces = np.where(flip[:, None], mesh.faces[:, ::-1], mesh.faces)
+    again, notes = repaired(mesh.vertices, faces)
+    good, _ = repaired(mesh.vertices, mesh.faces)
+    np.testing.assert_array_equal(again.faces, good.faces)
+    assert "to agree with the neighbours" in notes
+
+
+def test_collapsed_and_repeated_faces_are_dropped():
+    mesh = box()
+    extra = [[0, 0, 1], [2, 3, 2], *mesh.faces[:2], mesh.faces[5][[1, 2, 0]]]
+    again, notes = repaired(mesh.vertices, np.concatenate([mesh.faces, extra]))
+    assert "dropped 2 collapsed faces" in notes
+    assert "dropped 3 faces that repeat or cancel another" in notes
+    assert len(again.faces) == 12
+    assert again.volume == pytest.approx(1e5, rel=1e-12)
+
+
+def test_a_stray_face_without_area_is_dropped():
+    mesh = box()
+    vertices = np.concatenate([mesh.vertices, [[0, 0, 60], [1, 0, 60], [2, 0, 60]]])
+    again, notes = repaired(vertices, np.concatenate([mesh.faces, [[8, 9, 10]]]))
+    assert notes == "dropped 1 face without area"
+    assert len(again.faces) == 12
+
+
+def test_a_two_sided_mesh_becomes_one_sided():
+    mesh = ball()
+    again, notes = repaired(mesh.vertices, np.concatenate([mesh.faces, mesh.faces[:, ::-1]]))
+    assert "written two-sided" in notes
+    assert len(again.faces) == len(mesh.faces)
+
+
+def test_vertices_a_micrometre_apart_are_welded():
+    soup = ball().triangles.reshape(-1, 3)
+    soup = soup + np.random.default_rng(0).uniform(-2e-4, 2e-4, soup.shape)
+    again, notes = repaired(soup, np.arange(len(soup)).reshape(-1, 3))
+    assert "welded" in notes
+    assert again.is_watertight
+    assert len(again.vertices) == len(ball().vertices)
+
+
+def test_small_holes_are_filled():
+    mesh = trimesh.creation.icosphere(5, 50.0)  # edges of 2 mm
+    ring = np.flatnonzero(np.any(mesh.faces == 700, axis=1))
+    lone = next(
+        f for f in range(len(mesh.faces)) if not np.isin(mesh.faces[f], mesh.faces[ring]).any()
+    )
+    rest = np.delete(mesh.faces, [*ring, lone], axis=0)
+    again, notes = repaired(mesh.vertices, rest)
+    assert notes.startswith("filled 2 holes, the largest ")
+    assert again.is_watertight
+    # a flat lid on a cap 2 mm wide takes 0.2 mm^3 of 523,000
+    assert again.volume == pytest.approx(mesh.volume, rel=1e-6)
+
+
+def test_one_missing_triangle_is_filled_even_on_a_coarse_mesh():
+    again, notes = repaired(box().vertices, box().faces[1:])
+    assert notes == "filled 1 hole, the largest 53.9 mm across"
+    assert again.volume == pytest.approx(1e5, rel=1e-12)
+
+
+def test_cracked_bodies_are_united_too():
+    """Two overlapping boxes, each of two halves that meet without sharing vertices."""
+    cracked = []
+    for mesh in (box(), box((20, 20, 100))):
+        top = np.flatnonzero(mesh.face_normals[:, 2] > 0.5)
+        cracked.append(
+            trimesh.Trimesh(*trimesh.remesh.subdivide(mesh.vertices, mesh.faces, face_index=top))
+        )
+    solid, notes = repaired(*both(*cracked))
+    assert "closed 8 slits" in notes
+    assert "united 2 bodies" in notes
+    assert solid.volume == pytest.approx(1e5 + 4e4 - 8e3, rel=1e-6)
+
+
+def test_a_large_hole_is_refused_with_the_number_of_open_edges():
+    mesh = box()
+    top = mesh.face_normals[:, 2] > 0.5
+    with pytest.raises(InputError, match="part: not a closed solid: 4 open edges around 1 hole, "):
+        repaired(mesh.vertices, mesh.faces[~top])
+
+
+def test_a_surface_is_refused():
+    upper = ball().triangles_center[:, 2] > 0
+    with pytest.raises(InputError, match=r"not a closed solid: .* 1[34].* mm across"):
+        repaired(ball().vertices, ball().faces[upper])
+
+
+def test_overlapping_bodies_lose_their_inner_walls():
+    cross, notes = repaired(*both(box(), box((20, 20, 100))))
+    assert "united 2 bodies" in notes
+    assert cross.is_watertight
+    # 100x50x20 and 20x20x100 share 20x20x20
+    assert cross.volume == pytest.approx(1e5 + 4e4 - 8e3, rel=1e-6)
+    assert cross.area == pytest.approx(16000 + 8800 - 2 * 400 - 4 * 400, rel=1e-6)
+
+
+@pytest.mark.parametrize("height", [20.0, 12.0])
+def test_touching_bodies_lose_the_wall_between_them(height):
+    vertices, faces = both(box(), box((100, 50, height), at=(100, 0, 0)))
+    solid, notes = repaired(vertices, faces)
+    assert "united 2 bodies" in notes
+    wall = 2 * 50 * height
+    lone = 2 * (100 * 50 + 100 * height + 50 * height)
+    assert solid.area == pytest.approx(16000 + lone - wall, rel=1e-6)
+    assert solid.volume == pytest.approx(1e5 + 5000 * height, rel=1e-6)
+
+
+def test_bodies_that_touch_along_an_edge_stay_two():
+    solid, notes = repaired(*both(box(), box(at=(100, 50, 0))))
+    assert notes == "has 2 separate bodies"
+    assert solid.volume == pytest.approx(2e5, rel=1e-12)
+
+
+def test_separate_bodies_are_kept_and_mentioned():
+    solid, notes = repaired(*both(box(), ball(at=(0, 0, 200))))
+    assert notes == "has 2 separate bodies"
+    assert len(solid.faces) == 12 + len(ball().faces)
+
+
+def test_a_body_inside_another_is_an_inner_wall():
+    solid, notes = repaired(*both(ball(), box((10, 10, 10))))
+    assert "united 2 bodies" in notes
+    assert solid.volume == pytest.approx(ball().volume, rel=1e-6)
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_closed_cavities_are_dropped(inverted):
+    hollow = box((10, 10, 10))
+    hollow.invert()
+    vertices, faces = both(ball(), hollow)
+    solid, notes = repaired(vertices, faces[:, ::-1] if inverted else faces)
+    assert "dropped 1 closed cavity that no camera can see" in notes
+    assert ("inside-out" in notes) == inverted
+    assert len(solid.faces) == len(ball().faces)
+
+
+def test_flat_meshes_are_refused():
+    square = np.array([[0.0, 0, 0], [50, 0, 0], [50, 50, 0], [0, 50, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 1, 3], [1, 2, 3]])
+    with pytest.raises(InputError, match="part: encloses no volume"):
+        repaired(square, faces)
+    with pytest.raises(InputError, match="collapsed to a line or a point"):
+        repaired(np.zeros((3, 3)), [[0, 1, 2]])
+
+
+def test_a_moebius_strip_is_refused():
+    turn = np.linspace(0, 2 * np.pi, 30, endpoint=False)
+    across = np.array([-1, 1])[None, :] * 5
+    r = 40 + across * np.cos(turn / 2)[:, None]
+    xyz = np.stack(
+        [r * np.cos(turn)[:, None], r * np.sin(turn)[:, None], across * np.sin(turn / 2)[:, None]],
+        -1,
+    ).reshape(-1, 3)
+    i = np.arange(30)
+    a, b, c, d = 2 * i, 2 * i + 1, 2 * i + 2, 2 * i + 3
+    c[-1], d[-1] = 1, 0  # joined with a twist
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+    with pytest.raises(InputError, match="one side only"):
+        repaired(xyz, faces)
+
+
+def test_a_fin_where_three_surfaces_meet_is_refused():
+    mesh = box()
+    vertices = np.concatenate([mesh.vertices, [[0.0, 0, 90]]])
+    a, b = mesh.faces[0][:2]
+    with pytest.raises(InputError, match="at 1 edge three or more surfaces meet"):
+        repaired(vertices, np.concatenate([mesh.faces, [[a, b, 8]]]))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_vertices_that_are_not_finite_are_refused_and_counted(bad):
+    vertices = np.array(box().vertices)
+    vertices[5, 1] = bad
+    with pytest.raises(InputError, match=r"1 of 8 vertices are not finite .*vertex 5\)"):
+        repaired(vertices, box().faces)
+
+
+def test_a_vertex_that_no_face_uses_does_not_matter():
+    vertices = np.concatenate([box().vertices, [[np.nan, 0, 0], [1e9, 0, 0]]])
+    mesh, notes = repaired(vertices, box().faces)
+    assert notes == ""
+    assert len(mesh.vertices) == 8
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "message"),
+    [
+        (np.zeros((0, 3)), np.zeros((0, 3), int), "has no faces"),
+        (np.zeros((4, 3)), np.zeros((0, 3), int), "has no faces"),
+        (np.zeros((4, 2)), np.array([[0, 1, 2]]), r"vertices have shape \(4, 2\)"),
+        (np.zeros((4, 3)), np.array([[0, 1, 2, 3]]), r"faces have shape \(1, 4\)"),
+        (np.zeros((4, 3)), np.array([[0.0, 1, 2]]), "not integer"),
+        (np.zeros((4, 3)), np.array([[0, 1, 4]]), r"outside 0\.\.3"),
+        (np.zeros((4, 3)), np.array([[0, 1, -1]]), r"outside 0\.\.3"),
+    ],
+)
+def test_arrays_that_are_no_mesh_are_refused(vertices, faces, message):
+    with pytest.raises(InputError, match=message):
+        repair_solid(vertices, faces, name="part")
+
+
+def test_far_from_the_origin_single_precision_is_too_coarse():
+    with pytest.raises(InputError, match="single precision rounds"):
+        repaired(*both(box(at=(2e4, 0, 0))))
+
+
+def test_vertices_that_meet_by_the_thousand_are_not_paired_one_by_one(monkeypatch):
+    """A cone whose faces share no vertex: all of its tips are less than a micrometre apart."""
+    count = 60
+    turn = 2 * np.pi * np.arange(count + 1) / count
+    rim = np.stack([50 * np.cos(turn), 50 * np.sin(turn), 0 * turn], axis=1)
+    tips = np.array([0, 0, 40]) + np.random.default_rng(0).uniform(-2e-5, 2e-5, (count, 3))
+    side = np.stack([rim[:-1], rim[1:], tips], axis=1)
+    base = np.stack([rim[1:], rim[:-1], np.zeros((count, 3))], axis=1)
+    soup = np.concatenate([side, base]).reshape(-1, 3)
+    faces = np.arange(len(soup)).reshape(-1, 3)
+    cone, notes = repaired(soup, faces)
+    assert "welded" in notes
+    assert cone.is_watertight
+    monkeypatch.setattr(mesh_repair, "MAX_PAIRS", count)  # there are count^2 / 2
+    with pytest.raises(InputError, match="open edges"):
+        repaired(soup, faces)
+
+
+def test_a_face_that_welding_collapses_is_refused_as_any_other():
+    sliver = np.array([[0.0, 0, 0], [100, 0, 0], [0, 1e-4, 0]])  # narrower than the welding's reach
+    with pytest.raises(InputError, match="every face is collapsed"):
+        repair_solid(sliver, np.array([[0, 1, 2]]), name="part")
+
+
+def test_too_many_faces_and_bodies_are_refused(monkeypatch):
+    many = both(*(box((1, 1, 1), at=(2 * i, 0, 0)) for i in range(257)))
+    with pytest.raises(InputError, match="257 separate bodies"):
+        repaired(*many)
+    monkeypatch.setattr(mesh_repair, "MAX_FACES", 11)
+    with pytest.raises(InputError, match="12 faces are more than the 11"):
+        repaired(box().vertices, box().faces)
+
+
+@hypothesis.given(st.data())
+@hypothesis.settings(max_examples=100, deadline=None)
+def test_any_triangles_give_a_closed_solid_or_an_input_error(data):
+    """Tetrahedra on a coarse grid, with faces lost and added: every coincidence turns up."""
+    corner = st.tuples(*[st.integers(0, 2)] * 3)
+    tetrahedra = data.draw(st.lists(st.tuples(*[corner] * 4), min_size=1, max_size=5))
+    soup = [t[i : i + 1] + t[j : j + 1] + t[k : k + 1] for t in tetrahedra for i, j, k in SIDES]
+    for lost in data.draw(st.lists(st.integers(0, len(soup) - 1), max_size=2, unique=True)):
+        soup[lost] = soup[-1]
+    soup += data.draw(st.lists(st.tuples(*[corner] * 3), max_size=2))
+    vertices = np.array(soup, float).reshape(-1, 3)
+    try:
+        repaired(vertices, np.arange(len(vertices)).reshape(-1, 3))
+        hypothesis.event("solid")
+    except InputError as error:
+        hypothesis.event(str(error)[:20])
+
+
+SIDES = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)]
+
+
+@hypothesis.given(
+    st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=2, max_size=5, unique=True),
+    st.integers(0, 2**32 - 1),
+)
+@hypothesis.settings(max_examples=60, deadline=None)
+def test_the_union_of_boxes_has_the_volume_of_their_cells(places, seed):
+    """Boxes of 2 x 2 x 2 cells on a grid overlap, touch by a face, an edge or a corner."""
+    rng = np.random.default_rng(seed)
+    boxes = [box((20, 20, 20), at=10 * np.array(place)) for place in places]
+    soup = np.concatenate([b.triangles for b in boxes])
+    soup = soup[rng.permutation(len(soup))].reshape(-1, 3)
+    cells = {
+        (x + i, y + j, z + k) for x, y, z in places for i in (0, 1) for j in (0, 1) for k in (0, 1)
+    }
+    solid, _ = repaired(soup, np.arange(len(soup)).reshape(-1, 3))
+    assert solid.volume == pytest.approx(1000 * len(cells), rel=1e-6)  # float32 of 20 mm
+    walls = sum((x + dx, y + dy, z + dz) not in cells for x, y, z in cells for dx, dy, dz in STEPS)
+    assert solid.area == pytest.approx(100 * walls, rel=1e-6)
+
+
+STEPS = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]

@@ -1,0 +1,140 @@
+"""Nearest surface points against every triangle, and against the bounds of grid and samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from example_scans import box, model, vane
+from trimesh.triangles import closest_point
+
+from vanejax.cad.part import Part
+from vanejax.cad.surface import CELLS, SAMPLES, Surface
+
+
+def distance_to_every_triangle(part: Part, points: np.ndarray) -> np.ndarray:
+    """The smallest distance [n] over all faces, one point at a time."""
+    triangles = np.asarray(part.mesh.triangles)
+    distance = []
+    for point in points:
+        feet = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
+        distance.append(np.linalg.norm(feet - point, axis=1).min())
+    return np.array(distance)
+
+
+def around(part: Part, count: int, reach: float, seed: int = 0) -> np.ndarray:
+    """Points [n, 3] in the part's bounding box, grown by ``reach`` of its radius."""
+    low, high = part.mesh.bounds
+    grow = reach * part.radius
+    return np.random.default_rng(seed).uniform(low - grow, high + grow, (count, 3))
+
+
+def surface(part: Part) -> Surface:
+    return model(part).surface
+
+
+@pytest.mark.parametrize("make", [vane, box])
+def test_exact_feet_are_on_the_surface_of_the_face_that_they_name(make):
+    part = make()
+    points = around(part, 500, 0.2)
+    feet = surface(part).exact(points)
+    corners = np.asarray(part.mesh.triangles)[feet.face]
+    again = closest_point(corners, points)
+    np.testing.assert_allclose(feet.points, again, atol=1e-9)  # f64 eps x 100 mm x 100
+    np.testing.assert_allclose(feet.normals, part.mesh.face_normals[feet.face], atol=1e-12)
+
+
+def test_exact_is_the_nearest_of_all_triangles_of_a_box():
+    points = around(box(), 300, 0.3)
+    feet = surface(box()).exact(points)
+    distance = np.linalg.norm(points - feet.points, axis=1)
+    np.testing.assert_allclose(distance, distance_to_every_triangle(box(), points), atol=1e-9)
+
+
+def test_exact_on_small_faces_is_off_by_less_than_a_face():
+    points = around(vane(), 60, 0.1)
+    feet = surface(vane()).exact(points)
+    distance = np.linalg.norm(points - feet.points, axis=1)
+    true = distance_to_every_triangle(vane(), points)
+    assert (distance > true - 1e-9).all()
+    assert np.median(distance - true) < 1e-9
+    assert np.max(distance - true) < 0.5  # mm; samples are 1 mm apart, the faces there smaller
+
+
+def test_exact_gives_points_of_the_surface_back():
+    points, normals, _ = vane().sample(2000, seed=5)
+    feet = surface(vane()).exact(points)
+    off = np.linalg.norm(feet.points - points, axis=1)
+    # a face much smaller than the 1 mm between samples has none: its neighbour is found
+    assert np.mean(off < 1e-9) > 0.75
+    assert off.max() < 1.1
+    # and as neighbours are nearly in one plane, the height above the surface is hardly wrong
+    height = np.einsum("ni,ni->n", points - feet.points, feet.normals)
+    assert np.quantile(np.abs(height), 0.9) < 0.005
+    lifted = points + 0.05 * normals
+    again = surface(vane()).exact(lifted)
+    height = np.einsum("ni,ni->n", lifted - again.points, again.normals)
+    assert np.median(height) == pytest.approx(0.05, abs=1e-9)  # outward is positive
+
+
+def test_samples_are_the_nearest_samples():
+    found = surface(vane())
+    points = around(vane(), 50, 0.2)
+    feet = found.nearest(points)
+    distance = np.linalg.norm(points - feet.points, axis=1)
+    every = np.linalg.norm(points[:, None] - found.points, axis=-1)
+    np.testing.assert_array_equal(distance, every.min(axis=1))
+    index = every.argmin(axis=1)
+    np.testing.assert_array_equal(feet.normals, found.normals[index])
+    np.testing.assert_array_equal(feet.face, found.face[index])
+
+
+def test_samples_are_as_close_as_their_spacing_says():
+    part, found = vane(), surface(vane())
+    points, _, _ = part.sample(5000, seed=7)
+    gap = np.linalg.norm(points - found.nearest(points).points, axis=1)
+    spacing = np.sqrt(part.mesh.area / SAMPLES)
+    # Poisson samples of density 1 / spacing^2: the mean distance to the nearest is spacing / 2
+    assert gap.mean() == pytest.approx(spacing / 2, rel=0.1)
+    # P(none within r) = exp(-pi r^2 / spacing^2): one in 10^4 of 5000 points beyond 2.2 spacings
+    assert gap.max() < 2.5 * spacing
+    assert spacing < 1.1  # mm, as the module says
+
+
+@pytest.mark.parametrize("make", [vane, box])
+def test_the_grid_is_right_to_a_cell(make):
+    part = make()
+    found = surface(part)
+    points = around(part, 3000, 0.29)
+    low, high = part.mesh.bounds
+    cell = (np.ptp(part.mesh.bounds, axis=0).max() + 0.6 * part.radius) / CELLS
+    coarse = np.linalg.norm(points - found.coarse(points).points, axis=1)
+    nearest = np.linalg.norm(points - found.nearest(points).points, axis=1)
+    assert (coarse >= nearest).all()
+    # a cell's diagonal at the point and one at the sample
+    assert np.max(coarse - nearest) <= 2 * np.sqrt(3) * cell
+    assert np.mean(coarse - nearest) < 0.5 * cell
+    assert (high > low).all()
+
+
+def test_beyond_the_grid_the_border_answers():
+    """Far points come from poses on their way: any sensible sample will do, but it must be one."""
+    part, found = vane(), surface(vane())
+    far = part.center + 1e4 * np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, -1]])
+    feet = found.coarse(far)
+    assert np.isfinite(feet.points).all()
+    side = np.sign(far - part.center)
+    axis = np.argmax(np.abs(side), axis=1)
+    rows = np.arange(len(far))
+    assert (feet.points[rows, axis] * side[rows, axis] > 0).all()  # on the side that faces them
+
+
+def test_the_seed_decides_the_samples():
+    again, other = Surface(box()), Surface(box(), seed=1)
+    np.testing.assert_array_equal(again.points, surface(box()).points)
+    assert not np.array_equal(other.points, again.points)
+
+
+def test_no_point_at_all_has_no_feet():
+    found = surface(box())
+    for ask in (found.coarse, found.nearest, found.exact):
+        assert ask(np.zeros((0, 3))).points.shape == (0, 3)

@@ -1,0 +1,289 @@
+"""``vanejax compensate``: what it prints is the work frame, what it refuses, and its page."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from example_result import example_result, pose
+
+from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cli.program import main
+from vanejax.errors import InputError
+from vanejax.machine.frame_notation import NOTATIONS, read_kuka, read_matrix, write_kuka
+from vanejax.machine.pose_file import read_record, write_result
+from vanejax.machine.tool_path import ToolPath, read_tool_path, write_tool_path
+from vanejax.rigid import RigidTransform
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "machine.md").read_text()
+
+PART_FROM_CAMERA = example_result().part_from_camera
+MACHINE_FROM_CAMERA = pose((170.0, 5.0, 80.0), (900.0, -150.0, 800.0))
+MACHINE_FROM_PART = MACHINE_FROM_CAMERA @ PART_FROM_CAMERA.inverse()
+NOMINAL = pose((0.2, -0.3, 1.0), (1.0, 2.0, -1.5)) @ MACHINE_FROM_PART
+ROUNDED = {"rtol": 0, "atol": 2e-4}  # half of 1e-4 mm, and 1e-5 deg at 400 mm
+
+
+@pytest.fixture(scope="module")
+def box() -> Part:
+    mesh = trimesh.creation.box((40.0, 60.0, 10.0))
+    return part_from_mesh(mesh.vertices, mesh.faces, name="box")
+
+
+@pytest.fixture
+def files(box: Part, tmp_path: Path, monkeypatch) -> Path:
+    """A folder with a pose of each verdict, a calibration, a nominal frame, a path and the part."""
+    monkeypatch.chdir(tmp_path)
+    for status in ("accepted", "ambiguous", "rejected"):
+        write_result(
+            f"{status}.json",
+            example_result(status),
+            scan_name="scan",
+            part_name="box",
+            part_sha256=box.sha256,
+        )
+    camera = {"machine_from_camera": MACHINE_FROM_CAMERA.as_matrix().tolist()}
+    Path("camera.json").write_text(json.dumps(camera))
+    Path("nominal.txt").write_text(write_kuka(NOMINAL))
+    top = np.array([[-15.0, -25, 5], [15, -25, 5], [15, 25, 5], [-15, 25, 5]])
+    write_tool_path("path.csv", ToolPath(top, np.tile([0.0, 0, 1], (4, 1))))
+    box.export("box.stl")
+    return tmp_path
+
+
+CELL = ["accepted.json", "--camera-pose", "camera.json", "--nominal", "nominal.txt"]
+
+
+def sections(out: str) -> list[str]:
+    return out.rstrip("\n").split("\n\n")
+
+
+def indented(section: str) -> str:
+    return "\n".join(line for line in section.splitlines()[1:] if "rounding" not in line)
+
+
+def test_it_prints_the_work_frame_in_every_notation(files: Path, capsys) -> None:
+    assert main(["compensate", *CELL]) == 0
+    _, *blocks = sections(capsys.readouterr().out)
+    assert [block.splitlines()[0] for block in blocks[:5]] == [
+        f"{notation.title}: {notation.formula}" for notation in NOTATIONS.values()
+    ]
+    for block, notation in zip(blocks, NOTATIONS.values(), strict=False):
+        found = notation.read(indented(block))
+        np.testing.assert_allclose(found.as_matrix(), MACHINE_FROM_PART.as_matrix(), **ROUNDED)
+
+
+def test_it_prints_the_compensation_in_both_frames(files: Path, capsys) -> None:
+    assert main(["compensate", *CELL, "--format", "kuka"]) == 0
+    head, kuka, words, in_machine, in_part = sections(capsys.readouterr().out)
+    assert head.startswith("work frame: machine_from_part")
+    np.testing.assert_allclose(
+        read_kuka(kuka).as_matrix(), MACHINE_FROM_PART.as_matrix(), **ROUNDED
+    )
+    machine, part = read_kuka(in_machine), read_kuka(in_part)
+    assert "actual nominal^-1" in in_machine
+    assert "nominal^-1 actual" in in_part
+    actual = MACHINE_FROM_PART.as_matrix()
+    # 1e-5 deg at 900 mm
+    limits = {"rtol": 0, "atol": 5e-4}
+    np.testing.assert_allclose((machine @ NOMINAL).as_matrix(), actual, **limits)
+    np.testing.assert_allclose((NOMINAL @ part).as_matrix(), actual, **limits)
+    moved = MACHINE_FROM_PART.translation - NOMINAL.translation
+    (found,) = re.findall(r"origin is moved by (.*) mm", words)
+    np.testing.assert_allclose([float(v) for v in found.split(", ")], moved, **ROUNDED)
+    # 0.2, -0.3, 1.0 deg about x, y, z, the other way round: 1.063 deg by hand
+    assert len(re.findall(r"turned by 1\.06\d\d deg about", words)) == 2
+
+
+def test_other_formats_show_the_compensation_as_a_matrix(files: Path, capsys) -> None:
+    assert main(["compensate", *CELL, "--format", "iso"]) == 0
+    _, _, _, in_machine, _ = sections(capsys.readouterr().out)
+    found = read_matrix(indented(in_machine)) @ NOMINAL
+    np.testing.assert_allclose(found.as_matrix(), MACHINE_FROM_PART.as_matrix(), **ROUNDED)
+
+
+def test_without_a_calibration_the_scan_is_in_the_machine(files: Path, capsys) -> None:
+    assert main(["compensate", "accepted.json", "--format", "kuka"]) == 0
+    out = capsys.readouterr().out
+    expected = PART_FROM_CAMERA.inverse().as_matrix()
+    np.testing.assert_allclose(read_kuka(out).as_matrix(), expected, **ROUNDED)
+    assert "note: the scan's frame is taken to be the machine's (no --camera-pose)" in out
+    assert "compensation" not in out
+
+
+@pytest.mark.parametrize(("status", "code"), [("ambiguous", 3), ("rejected", 4)])
+def test_a_doubtful_pose_moves_nothing(files: Path, capsys, status: str, code: int) -> None:
+    command = ["compensate", f"{status}.json", "--tool-path", "path.csv", "--out", "moved.csv"]
+    assert main(command) == code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"vanejax: refused: {status}.json is {status}: made up to be {status}; ")
+    assert err.endswith(f"--accept-verdict {status}\n")
+    assert err.count("\n") == 1
+    assert not Path("moved.csv").exists()
+    assert main([*command, "--accept-verdict", status]) == 0
+    assert f"note: the pose is {status}: made up" in capsys.readouterr().out
+    assert Path("moved.csv").exists()
+
+
+def test_who_takes_ambiguous_takes_no_rejected_pose(files: Path, capsys) -> None:
+    assert main(["compensate", "rejected.json", "--accept-verdict", "ambiguous"]) == 4
+    assert main(["compensate", "ambiguous.json", "--accept-verdict", "rejected"]) == 0
+
+
+def test_a_pose_by_hand_has_no_verdict(files: Path, capsys) -> None:
+    Path("hand.txt").write_text(" ".join(map(str, PART_FROM_CAMERA.as_matrix().ravel())))
+    assert main(["compensate", "hand.txt", "--format", "matrix"]) == 0
+    assert "note: the pose has no verdict: nobody checked it" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("frame", ["part", "machine"])
+def test_the_path_is_moved_to_the_part(files: Path, capsys, frame: str) -> None:
+    path = read_tool_path("path.csv")
+    if frame == "machine":
+        write_tool_path("path.csv", path.moved(NOMINAL))
+    command = ["--tool-path", "path.csv", "--out", "moved.csv", "--path-frame", frame]
+    assert main(["compensate", *CELL, *command, "--part", "box.stl"]) == 0
+    found = read_tool_path("moved.csv")
+    expected = path.moved(MACHINE_FROM_PART)
+    np.testing.assert_allclose(found.points, expected.points, rtol=0, atol=5e-4)
+    np.testing.assert_allclose(found.axes, expected.axes, rtol=0, atol=1e-6)
+    words = sections(capsys.readouterr().out)[-1]
+    assert words.startswith("tool path: 4 points with tool axes, machine frame: moved.csv")
+    assert re.search(r"compensated: .* by 0\.000\d mm .*; 100\.0% within 0\.05 mm", words)
+    assert re.search(r"as programmed: .* [1-9]\.\d+ mm at most; 0\.0% within 0\.05 mm", words)
+
+
+def test_what_rounding_costs_is_said_for_the_part(files: Path, capsys) -> None:
+    assert main(["compensate", *CELL, "--part", "box.stl"]) == 0
+    costs = re.findall(r"rounding: at most (\S+) mm", capsys.readouterr().out)
+    assert len(costs) == len(NOTATIONS)
+    # the corner of the box is 36 mm away
+    assert all(0 < float(cost) < 3**0.5 * 5e-5 + 36.4 * 3 * np.radians(5e-6) for cost in costs)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["none.json"], "none.json: no such file"),
+        (["accepted.json", "--nominal", "camera.json"], 'has no "machine_from_part"'),
+        (["accepted.json", "--camera-pose", "accepted.json"], 'has no "machine_from_camera"'),
+        (["accepted.json", "--nominal", "path.csv"], "neither JSON nor 16 numbers"),
+        (["accepted.json", "--tool-path", "path.csv"], "--tool-path and --out go together"),
+        (["accepted.json", "--out", "moved.csv"], "--tool-path and --out go together"),
+        (["accepted.json", "--path-frame", "machine"], "--path-frame machine needs --nominal"),
+        (["accepted.json", "--tolerance-mm", "0"], "--tolerance-mm 0.0: should be more"),
+        (["accepted.json", "--tool-path", "path.csv", "--out", "path.csv"], "is an input already"),
+        (["accepted.json", "--tool-path", "path.csv", "--out", "no/a.csv"], "No such file"),
+        (["accepted.json", "--part", "vane"], "is not the part of accepted.json"),
+        (["accepted.json", "--format", "din"], "invalid choice: 'din'"),
+        (["odd.json"], "its verdict has no status accepted, ambiguous, rejected"),
+    ],
+)
+def test_bad_input_is_one_line(files: Path, capsys, arguments: list[str], words: str) -> None:
+    values = json.loads(Path("accepted.json").read_text())
+    Path("odd.json").write_text(json.dumps(values | {"verdict": {"status": "fine"}}))
+    assert main(["compensate", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("vanejax: error: ")
+    assert err.count("\n") == 1
+    assert words in err
+    assert not Path("moved.csv").exists()
+
+
+def test_the_record_of_a_pose(files: Path, box: Part) -> None:
+    record = read_record("ambiguous.json")
+    assert (record.verdict.status, record.part_sha256) == ("ambiguous", box.sha256)
+    found, truth = record.part_from_camera.as_matrix(), PART_FROM_CAMERA.as_matrix()
+    np.testing.assert_allclose(found, truth, rtol=0, atol=1e-14)
+    Path("bare.json").write_text(json.dumps(np.eye(4).tolist()))
+    bare = read_record("bare.json")
+    assert (bare.verdict, bare.part_sha256) == (None, None)
+    Path("word.json").write_text(
+        json.dumps({"part_from_camera": np.eye(4).tolist(), "verdict": "accepted"})
+    )
+    with pytest.raises(InputError, match="its verdict has no status"):
+        read_record("word.json")
+
+
+# the page
+
+
+def fenced(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+
+
+NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
+
+
+def test_every_command_of_the_page_gives_what_it_shows(tmp_path: Path, monkeypatch, capsys) -> None:
+    """In the order of the page; words to the letter, numbers to 0.002.
+
+    A registration differs in its last digits from machine to machine.
+    """
+    monkeypatch.chdir(tmp_path)
+    environment = os.environ | {"PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
+    environment |= {"VANEJAX_CACHE_DIR": "off"}
+    blocks = re.findall(r"^```(sh|python|text)\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    shown, printed, commands = 0, None, []
+    for language, block in blocks:
+        if language == "text":
+            if printed is None:
+                continue  # a drawing
+            assert re.sub(NUMBER, "0", printed) == re.sub(NUMBER, "0", block)
+            numbers = [[float(n) for n in re.findall(NUMBER, t)] for t in (printed, block)]
+            np.testing.assert_allclose(numbers[0], numbers[1], rtol=0, atol=2e-3)
+            shown, printed = shown + 1, None
+            continue
+        if language == "python":
+            exec(compile(block, "docs/machine.md", "exec"), {})
+            printed = capsys.readouterr().out
+            continue
+        shell = f'set -e\nvanejax() {{ "$PYTHON" -m vanejax "$@"; }}\n{block}'
+        done = subprocess.run(
+            ["bash", "-c", shell], env=environment, text=True, capture_output=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+        printed = done.stdout
+        commands += re.findall(r"^vanejax (\w+)", block, re.MULTILINE)
+    assert commands[:3] == ["scan", "register", "compensate"]
+    assert shown == 5
+    # the six points to probe see every motion: none of 1 mm, or of 1 mm at 50 mm, hides from all
+    targets = read_tool_path("targets.csv")
+    moments = np.cross(targets.points - targets.points.mean(axis=0), targets.axes) / 50
+    seen = np.linalg.svd(np.concatenate([targets.axes, moments], axis=1), compute_uv=False)
+    assert seen.shape == (6,)
+    assert seen.min() > 0.1
+
+
+def test_the_page_names_every_formula_and_option() -> None:
+    for notation in NOTATIONS.values():
+        for formula in re.findall(r"R = [^:]*?\)(?=[,:;]| *$)", notation.formula):
+            assert formula in PAGE, formula
+    for option in ("--camera-pose", "--nominal", "--format", "--accept-verdict", "--tool-path"):
+        assert option in PAGE
+
+
+def test_the_numbers_of_the_page_are_the_displacement_that_was_made() -> None:
+    """The page says what was done to the part: the frames of its files and its answer agree."""
+    camera, nominal, *_ = re.findall(r"^\{X .*\}$", PAGE, re.MULTILINE)
+    from vanejax.cad.parametric_vane import guide_vane
+    from vanejax.scanner.camera import hemisphere_viewpoints
+
+    camera_from_part = hemisphere_viewpoints(guide_vane().center).view(40)
+    true = read_kuka(camera) @ camera_from_part
+    (answer,) = set(re.findall(r"^  (\{X 80.*\})$", PAGE, re.MULTILINE))
+    found = read_kuka(answer)
+    np.testing.assert_allclose(found.translation, true.translation, rtol=0, atol=0.005)
+    np.testing.assert_allclose(found.rotation, true.rotation, rtol=0, atol=5e-5)
+    assert np.linalg.norm(read_kuka(nominal).translation - true.translation) > 1.0
+    assert isinstance(true, RigidTransform)

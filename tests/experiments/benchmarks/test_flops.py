@@ -1,0 +1,60 @@
+"""The count of operations: that of XLA for a plain stack, and one by hand for the network."""
+
+from __future__ import annotations
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from experiments.benchmarks.flops import (
+    dense_flops,
+    feature_flops,
+    inference_flops,
+    match_flops,
+    neighbor_flops,
+    step_flops,
+)
+from vanejax.matching.rpmnet import RpmNet
+
+WIDTHS, ROWS = (10, 96, 96, 192), 640
+MODEL = RpmNet(num_neighbors=32)
+
+
+def stack(weights: list[jax.Array], x: jax.Array) -> jax.Array:
+    for weight in weights:
+        x = x @ weight
+    return x
+
+
+def counted(function, *arguments) -> float:
+    return jax.jit(function).lower(*arguments).compile().cost_analysis()["flops"]
+
+
+def test_a_stack_takes_what_xla_counts() -> None:
+    x = jnp.ones((ROWS, WIDTHS[0]))
+    weights = [jnp.ones(pair) for pair in itertools.pairwise(WIDTHS)]
+    forward = dense_flops(ROWS, WIDTHS)
+    assert counted(stack, weights, x) == pytest.approx(forward, rel=1e-3)
+    # three times, but for the gradient of what the first layer is given
+    gradient = jax.grad(lambda weights, x: jnp.sum(stack(weights, x) ** 2))
+    wanted = 3 * forward - dense_flops(ROWS, WIDTHS[:2])
+    assert counted(gradient, weights, x) == pytest.approx(wanted, rel=0.01)
+
+
+def test_the_networks_are_counted_by_hand() -> None:
+    around = 10 * 96 + 96 * 96 + 96 * 192
+    behind = 192 * 192 + 192 * 96 + 96 * 96
+    assert feature_flops(MODEL, 717) == 2 * 717 * (32 * around + behind)
+    annealing = 4 * 64 + 64 * 64 + 64 * 64 + 64 * 128 + 128 * 1024
+    cloud = 1024 * 512 + 512 * 256 + 256 * 2
+    assert match_flops(MODEL, 717, 1024) == 2 * (1741 * annealing + cloud + 717 * 1024 * 99)
+
+
+def test_the_reference_is_paid_once() -> None:
+    pair = feature_flops(MODEL, 700) + match_flops(MODEL, 700, 1000)
+    assert inference_flops(MODEL, 700, 1000, 5) == 5 * pair + neighbor_flops(700)
+    one, two = (step_flops(MODEL, 700, 1000, 2, batch) for batch in (1, 2))
+    firsts = 2 * dense_flops(32 * 700, (10, 96)) + 2 * dense_flops(1700, (4, 64))
+    assert two - one == 6 * pair - firsts + neighbor_flops(700)

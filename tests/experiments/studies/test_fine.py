@@ -1,0 +1,193 @@
+"""The study of fine registration: its noise, starts, errors and bound against their definitions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.runner.vane_views import VaneViews, beside, magnitudes, pose_error, with_noise
+from experiments.studies.fine import study as fine
+from experiments.studies.fine.study import (
+    Fit,
+    basin,
+    basin_table,
+    cramer_rao,
+    main,
+    refine_view,
+    summarize,
+    table,
+)
+from vanejax.errors import InputError
+from vanejax.localization.residuals import moved
+from vanejax.rigid import RigidTransform
+from vanejax.scanner.camera import Camera
+
+VIEW = 40
+
+
+@pytest.fixture(scope="module")
+def views() -> VaneViews:
+    return VaneViews(camera=Camera().scaled(0.12))
+
+
+@pytest.fixture(scope="module")
+def points(views: VaneViews) -> np.ndarray:
+    return views.points(VIEW)
+
+
+def one(pose: RigidTransform) -> RigidTransform:
+    return RigidTransform(pose.rotation[None], pose.translation[None])
+
+
+def test_the_test_views_are_the_papers(views: VaneViews) -> None:
+    azimuth = views.viewpoints.azimuth_deg
+    assert views.select("test") == [v for v in range(216) if azimuth[v] % 40 == 0]
+    assert views.select("all") == list(range(216))
+    assert views.select("3,1") == [3, 1]
+    for wrong in ("", "216", "-1", "some"):
+        with pytest.raises(InputError, match="test, all, or numbers below 216"):
+            views.select(wrong)
+
+
+def test_noise_is_along_the_rays(points: np.ndarray) -> None:
+    noisy = with_noise(points, 0.2, np.random.default_rng(0))
+    error = noisy - points
+    along = np.sum(error * points, axis=1) / np.linalg.norm(points, axis=1)
+    assert np.abs(np.cross(error, points)).max() < 1e-9  # f64 eps x 400 mm x 1 mm
+    # 2,000 points and more: the spread's own standard deviation is 1.6 %
+    assert np.std(along) == pytest.approx(0.2, rel=0.06)
+
+
+def test_a_start_is_as_far_off_as_it_says(views: VaneViews) -> None:
+    truth, center = views.truth(VIEW), views.part.center
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        start = beside(truth, views.part, deg=5.0, mm=3.0, rng=rng)
+        assert magnitudes(pose_error(start, truth, center)) == pytest.approx((5.0, 3.0), abs=1e-9)
+
+
+def test_the_error_undoes_itself(views: VaneViews) -> None:
+    """Applied to what was found as `residuals.moved` does, it gives the truth."""
+    truth = views.truth(VIEW)
+    found = beside(truth, views.part, deg=20.0, mm=9.0, rng=np.random.default_rng(3))
+    error = pose_error(found, truth, views.part.center)
+    again = moved(views.part, one(found), error[None])
+    np.testing.assert_allclose(again.rotation[0], truth.rotation, atol=1e-12)
+    np.testing.assert_allclose(again.translation[0], truth.translation, atol=1e-9)
+
+
+def test_the_bound_is_that_of_numerical_derivatives(views: VaneViews, points: np.ndarray) -> None:
+    truth, noise_mm, step = views.truth(VIEW), 0.3, 1e-6
+    model = views.model
+
+    def ranges(delta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        pose = moved(views.part, one(truth), delta[None])
+        directions = points @ pose.rotation[0].T
+        origins = np.broadcast_to(pose.translation[0], directions.shape)
+        hits = model.scanner.cast(origins, directions)
+        return hits.distance_mm, hits.face
+
+    pairs = [(ranges(step * axis), ranges(-step * axis)) for axis in np.eye(6)]
+    # a ray that changes its face on the way has no derivative
+    same = np.all([(a[1] == b[1]) & (a[1] >= 0) for a, b in pairs], axis=0)
+    assert same.mean() > 0.999
+    jacobian = np.stack([(a[0] - b[0])[same] / (2 * step) for a, b in pairs], axis=1)
+    expected = np.linalg.inv(jacobian.T @ jacobian) * noise_mm**2
+    found = cramer_rao(model, points, truth, noise_mm)
+    # a missing ray in 1000 may carry some of the information
+    np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.02)
+    np.testing.assert_allclose(cramer_rao(model, points, truth, 0.6), 4 * found, rtol=1e-9)
+
+
+def made_up(rng: np.random.Generator, *, claimed: float = 1.0, views: int = 400) -> list[Fit]:
+    """Fits whose errors are drawn from the bound; ``claimed`` scales the reported covariance."""
+    root = np.diag([1e-5] * 3 + [1e-3] * 3) @ (np.eye(6) + 0.2 * rng.standard_normal((6, 6)))
+    bound = root @ root.T
+    return [
+        Fit(
+            view=view,
+            error=root @ rng.standard_normal(6),
+            bound=bound,
+            covariance=claimed * bound,
+            noise_mm=0.1,
+            converged=True,
+            iterations=9,
+            num_points=1000,
+            seconds=0.5,
+        )
+        for view in range(views)
+    ]
+
+
+def test_an_honest_and_efficient_estimate_is_seen_to_be_one() -> None:
+    report = summarize(made_up(np.random.default_rng(0)), 0.1)
+    # 400 views of three components each: 2 to 3 % of chance
+    assert report["rotation_deg"]["ratio"] == pytest.approx(1, abs=0.1)
+    assert report["translation_mm"]["ratio"] == pytest.approx(1, abs=0.1)
+    assert report["anees"] == pytest.approx(1, abs=0.1)
+    assert report["coverage_95"] == pytest.approx(0.95, abs=0.035)
+    low, high = report["anees_interval_95"]
+    assert 0.94 < low < 1 < high < 1.06
+    assert report["noise_estimate_ratio"] == pytest.approx(1)
+    assert table([report]).splitlines()[-1].startswith("met")
+
+
+def test_a_covariance_that_is_too_small_is_seen() -> None:
+    report = summarize(made_up(np.random.default_rng(0), claimed=0.25), 0.1)
+    assert report["anees"] == pytest.approx(4, abs=0.4)
+    assert report["coverage_95"] < 0.5
+
+
+def test_one_bad_view_misses_the_goal() -> None:
+    fits = made_up(np.random.default_rng(0))
+    fits[3].error[3:] *= 50
+    report = summarize(fits, 0.1)
+    assert report["translation_mm"]["worst_view_ratio"] > 4
+    assert table([report]).splitlines()[-1].startswith("MISSED")
+
+
+def test_the_study_reaches_the_bound(tmp_path: Path, monkeypatch, capsys, views: VaneViews) -> None:
+    monkeypatch.setattr(fine, "VaneViews", lambda: views)
+    arguments = ["--noise-mm", "0.1,0.5", "--views", "0,120", "--out", str(tmp_path)]
+    report = main(fine.make_parser().parse_args(arguments))
+    assert json.loads((tmp_path / "fine.json").read_text()) == report
+    assert (tmp_path / "fine.png").stat().st_size > 10_000
+    assert [level["noise_mm"] for level in report["levels"]] == [0.1, 0.5]
+    for level in report["levels"]:
+        assert [row["view"] for row in level["rows"]] == [0, 120]
+        for name in ("rotation_deg", "translation_mm"):
+            assert level[name]["worst_view_ratio"] < 4
+        assert level["noise_estimate_ratio"] == pytest.approx(1, abs=0.1)
+    assert report["part"]["sha256"] == views.part.sha256
+    assert "worst view" in capsys.readouterr().out
+
+
+def test_draws_repeat_and_differ(views: VaneViews, points: np.ndarray) -> None:
+    """The same arguments give the same fit; another level, view or seed other noise and start."""
+
+    def relative_error(**changes: float) -> np.ndarray:
+        given = {"view": VIEW, "noise_mm": 0.1, "seed": 0} | changes
+        view, noise = int(given["view"]), given["noise_mm"]
+        fit = refine_view(
+            views, view, points if view == VIEW else views.points(view), noise_mm=noise,
+            start_deg=5.0, start_mm=5.0, seed=int(given["seed"]),
+        )  # fmt: skip
+        return fit.error / noise
+
+    first = relative_error()
+    np.testing.assert_array_equal(relative_error(), first)
+    for changes in ({"noise_mm": 0.2}, {"seed": 1}, {"view": 120}):
+        other = relative_error(**changes)
+        # the same draws, scaled, would agree to the nonlinearity of a few per cent
+        assert np.linalg.norm(other[3:] - first[3:]) > 0.2 * np.linalg.norm(first[3:])
+
+
+def test_from_five_degrees_all_arrive(views: VaneViews) -> None:
+    finer = VaneViews(camera=Camera().scaled(0.4))
+    rows = basin(finer, [VIEW], 0, degrees=(5.0,))
+    assert [(row["start_deg"], row["start_mm"]) for row in rows] == [(5, 5), (5, 10), (5, 20)]
+    assert rows[0]["arrived"] == 1.0
+    assert "100%" in basin_table(rows)

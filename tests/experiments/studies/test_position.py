@@ -1,0 +1,306 @@
+"""The virtual test stand, what its camera's errors do, and the tables and picture of section IV."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from experiments.runner.vane_views import VaneViews, beside, magnitudes, pose_error
+from experiments.studies.position import report as position_report
+from experiments.studies.position import study as position
+from experiments.studies.position import virtual_stand as stand
+from experiments.studies.position.study import Found, make_parser, move_rows, run_camera, turn_rows
+from experiments.studies.position.virtual_stand import Block, Stand
+from vanejax.cad.surface import Surface
+from vanejax.errors import InputError
+from vanejax.localization.fine_registration import refine
+from vanejax.localization.registration import register
+from vanejax.machine.calibration import Calibration
+from vanejax.machine.positioning import camera_motion, displacement, in_machine, screw_of
+from vanejax.plotting.canvas import save_figure
+from vanejax.rigid import RigidTransform
+from vanejax.scanner.measurement import measure
+from vanejax.scanner.sensor import Sensor, paper_camera
+from vanejax.scanner.virtual_scanner import Scanner
+
+VIEWS = VaneViews()
+VIEW = 108
+# coarse, and wrong in its calibration only
+KIND = dataclasses.replace(
+    Sensor().scaled(0.25), lens=paper_camera().scaled(0.25).lens, trueness=paper_camera().trueness
+)
+
+
+def build(sensor: Sensor = KIND, seed: int = 0) -> Stand:
+    return Stand.built(VIEWS.part, sensor, VIEWS.viewpoints.view(VIEW), np.random.default_rng(seed))
+
+
+def known(one: Stand) -> Calibration:
+    return Calibration(
+        one.machine_from_camera, np.zeros((6, 6)), np.zeros(3), np.zeros(8), np.zeros(8), 1.0
+    )
+
+
+def found_at(one: Stand, stages: list[RigidTransform], errors: list[np.ndarray]) -> list[Found]:
+    """Registrations that are off by small motions [6] in the part's frame."""
+    found = []
+    for stage, e in zip(stages, errors, strict=True):
+        turn = Rotation.from_rotvec(e[:3]).as_matrix()
+        center = one.part.center
+        off = RigidTransform(turn, center - turn @ center + e[3:])
+        truth = one.truth(stage)
+        found.append(
+            Found(off @ truth, truth, 1e-10 * np.eye(6), np.zeros((6, 10)), "accepted", 1.0)
+        )
+    return found
+
+
+def test_the_stage_turns_the_part_about_its_axis():
+    one = build()
+    stages = stand.turns(12)
+    assert len(stages) == 12
+    poses = [one.truth(stage) for stage in stages]
+    np.testing.assert_allclose(
+        poses[0].as_matrix(), one.camera_from_part.inverse().as_matrix(), atol=1e-9
+    )
+    for number, pose in enumerate(poses[1:6], 1):
+        seen = screw_of(camera_motion(poses[0], pose))
+        assert seen.angle_deg == pytest.approx(30 * number)
+        np.testing.assert_allclose(seen.axis, one.camera_from_stage.rotation[:, 2], atol=1e-9)
+        assert seen.along_mm == pytest.approx(0, abs=1e-9)
+    drawn, true = one.expected(stages[3]), one.moved(stages[3])
+    off = pose_error(drawn, true, true.apply(np.zeros((1, 3)))[0])
+    assert 0.05 < magnitudes(off)[0] < 5  # the drawing is a guess, and a good one
+
+
+def test_the_probe_sees_what_the_stage_does():
+    one = build()
+    (start, *_), stages = stand.moves(12), stand.moves(12)
+    np.testing.assert_array_equal(start.translation, 0)
+    before = one.probed(start, np.random.default_rng(1))
+    for stage in stages[1:]:
+        after = one.probed(stage, np.random.default_rng(2))
+        way = np.mean(after - before, axis=0)
+        assert np.linalg.norm(way) == pytest.approx(np.linalg.norm(stage.translation), abs=0.05)
+        truth = in_machine(one.moved(stage), one.machine_from_camera).translation
+        assert np.linalg.norm(way - truth) < 0.06  # three deviations of its mean in 3-D
+    for count in (1, 13):
+        with pytest.raises(InputError, match="positions must be from 2 to 12"):
+            stand.moves(count)
+
+
+def test_the_cube_is_as_flat_and_square_as_it_says():
+    block = Block.ground(np.random.default_rng(3))
+    surface = Surface(block.part)
+    for k in range(3):
+        places = np.random.default_rng(k).uniform(-55, -5, (400, 2))
+        points = block.on_face(k, places)
+        assert 0.008 < np.ptp(points[:, k]) < 0.02 * 2  # flatness, and the lean
+        # half a triangle of 4 mm in waves of 50 mm and more, 0.01 mm high; a foot in ten is sought
+        # on a neighbouring triangle
+        feet = surface.exact(points)
+        assert np.quantile(np.linalg.norm(points - feet.points, axis=1), 0.9) < 1e-3
+    lean = block.lean
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        assert 60 * abs(lean[:, i] @ lean[:, j]) < 0.02 * 1.01
+    np.testing.assert_allclose(block.part.extent_mm, 60, atol=0.05)
+
+
+def test_shifts_are_those_of_the_sensor():
+    scanner, pose = Scanner(VIEWS.part), VIEWS.viewpoints.view(VIEW)
+    rng = np.random.default_rng(4)
+    ideal = measure(scanner, Sensor(camera=KIND.camera), pose, rng).points.astype(np.float64)
+    wrong = measure(scanner, KIND, pose, rng).points - ideal
+    shifts = stand.shifts_mm(KIND, ideal)
+    assert np.abs(shifts).max() > 0.04
+    # float32 at 400 mm, and the lens sees the depth after its error
+    np.testing.assert_allclose(shifts, wrong, atol=3e-4)
+    apart = [stand.shifts_mm(one, ideal) for one in stand.causes(KIND)]
+    assert len(apart) == 10
+    np.testing.assert_allclose(np.sum(apart, axis=0), shifts, atol=1e-9)
+
+
+def test_what_the_camera_does_to_a_pose_is_what_happens():
+    one = build()
+    still = stand.turns(1)[0]
+    scan = one.scan(still, np.random.default_rng(5))
+    truth = one.truth(still)
+    fine = refine(one.model, scan.points, truth).part_from_camera
+    predicted = stand.pose_bias(one, scan, fine, stand.causes(KIND)).sum(axis=1)
+    actual = pose_error(fine, truth, one.part.center)
+    assert np.linalg.norm(actual[3:]) > 0.03
+    # the refinement weighs noise it fits itself, and drops what it takes for outliers
+    assert np.linalg.norm(predicted[3:] - actual[3:]) < 0.15 * np.linalg.norm(actual[3:])
+    assert np.degrees(np.linalg.norm(predicted[:3] - actual[:3])) < 0.004
+
+
+@pytest.fixture(scope="module")
+def placed() -> tuple[Stand, list[stand.Placed]]:
+    one = build(dataclasses.replace(KIND, noise_px=0.0125))
+    return one, stand.place_cubes(one, np.random.default_rng(6))
+
+
+def test_the_cube_joins_camera_and_machine(placed):
+    one, places = placed
+    for found in stand.calibrations(places):
+        rotation_deg, translation_mm = magnitudes(
+            pose_error(found.machine_from_camera, one.machine_from_camera, found.center)
+        )
+        assert rotation_deg < 0.05
+        assert translation_mm < 0.15
+        assert found.corner_mm.max() < 0.1
+
+
+def test_what_the_camera_does_to_the_frame_is_what_happens(placed):
+    one, places = placed
+    joint = stand.calibrations(places)[0]
+    predicted = stand.frame_bias(places, joint, stand.causes(KIND)).sum(axis=1)
+    actual = pose_error(joint.machine_from_camera, one.machine_from_camera, joint.center)
+    assert np.linalg.norm(predicted[3:]) > 0.02
+    # what is left is noise, of probe and scan
+    assert np.linalg.norm(actual[3:] - predicted[3:]) < 0.6 * np.linalg.norm(actual[3:])
+
+
+def test_perfect_registrations_have_no_error():
+    one = build()
+    none = [np.zeros(6)] * 12
+    turned = turn_rows(one, stand.turns(12), found_at(one, stand.turns(12), none))
+    assert max(abs(row["error_deg"]) for row in turned["rows"]) < 1e-9
+    assert turned["axis_error_deg"] < 1e-6
+    stages = stand.moves(12)
+    rows = move_rows(
+        one, stages, found_at(one, stages, none), known(one), np.zeros((6, 10)), seed=0, salt=0
+    )
+    for row in rows:
+        assert row["against_truth_mm"] < 1e-9
+        assert row["against_probe_mm"] == pytest.approx(row["probe_mm"])
+        assert row["origin_mm"] == pytest.approx(row["probe_mm"])
+
+
+def test_errors_are_told_where_they_are():
+    one = build()
+    stages, turn = stand.turns(12), np.radians(0.1)
+    axis_part = one.camera_from_part.inverse().rotation @ one.camera_from_stage.rotation[:, 2]
+    errors = [np.zeros(6)] * 12
+    errors[4] = np.concatenate([turn * axis_part, np.zeros(3)])
+    rows = turn_rows(one, stages, found_at(one, stages, errors))["rows"]
+    # the pose's error of the part seen from the camera is the opposite of the camera's of the part
+    assert rows[3]["error_deg"] == pytest.approx(-0.1, abs=1e-4)
+    assert rows[3]["whole_deg"] == pytest.approx(0.1, abs=1e-4)
+    assert abs(rows[4]["error_deg"]) < 1e-4
+    assert rows[3]["single"]["rotation_deg"] == pytest.approx(0.1)
+
+    stages = stand.moves(12)
+    errors = [np.zeros(6)] * 12
+    errors[2] = np.array([turn, 0, 0, 0.3, 0, 0])
+    found = found_at(one, stages, errors)
+    rows = move_rows(one, stages, found, known(one), np.zeros((6, 10)), seed=0, salt=0)
+    assert rows[1]["against_truth_mm"] == pytest.approx(0.3, abs=1e-3)
+    assert rows[1]["known_frame_mm"] == pytest.approx(0.3, abs=1e-3)
+    assert rows[0]["against_truth_mm"] < 1e-9
+    # 0.1 deg at 2 m: up to 3.4 mm that the part never did
+    assert 0.5 < rows[1]["origin_mm"] < 4
+    motion = in_machine(camera_motion(found[0].pose, found[2].pose), one.machine_from_camera)
+    away = np.linalg.norm(displacement(motion, np.zeros(3)) - rows[1]["true_mm"])
+    assert away > 0
+
+
+def test_a_wrong_frame_is_told_from_wrong_registrations():
+    one = build()
+    stages = stand.moves(12)
+    found = found_at(one, stages, [np.zeros(6)] * 12)
+    turn = RigidTransform(Rotation.from_rotvec([0, 0, 1e-3]).as_matrix(), np.zeros(3))
+    wrong = dataclasses.replace(known(one), machine_from_camera=turn @ one.machine_from_camera)
+    rows = move_rows(one, stages, found, wrong, np.zeros((6, 10)), seed=0, salt=0)
+    assert max(row["known_frame_mm"] for row in rows) < 1e-9
+    assert 0.02 < max(row["against_truth_mm"] for row in rows) <= 0.04  # 1e-3 of 40 mm
+
+
+@pytest.fixture(scope="module")
+def report() -> dict[str, Any]:
+    """The whole study, small: half the pixels, two turns and two moves, the first pose guessed."""
+
+    def guessed(scan, part, *, init, **settings):
+        if init is None:
+            truth = VIEWS.truth(VIEW)
+            init = beside(truth, part, deg=3, mm=3, rng=np.random.default_rng(0))
+        return register(scan, part, init=init, **settings)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(position, "preset", lambda name: paper_camera().scaled(0.5))
+        patch.setattr(position, "register", guessed)
+        camera = run_camera(VIEWS, VIEW, positions=3, weights=None, seed=0)
+    return json.loads(
+        json.dumps(
+            {
+                "method": "ray casting",
+                "sensor": position.SENSOR,
+                "positions": 3,
+                "cameras": [camera],
+            },
+            default=lambda array: array.tolist(),
+        )
+    )
+
+
+def test_the_study_registers_what_it_scanned(report):
+    (camera,) = report["cameras"]
+    rows = position_report.singles_of(camera)
+    assert len(rows) == 5
+    assert {row["verdict"] for row in rows} == {"accepted"}
+    assert position_report.is_met(report) == {"turns": True, "moves": True}
+    for row in position_report.turns_of(camera):
+        assert row["whole_deg"] < 0.1
+        assert 0 < row["sigma_noise_deg"] <= row["sigma_deg"] < 0.05
+    for row in position_report.moves_of(camera):
+        assert 0 < row["sigma_noise_mm"] <= row["sigma_mm"] < 0.1
+        assert row["true_mm"] == pytest.approx(np.linalg.norm(row["stage_mm"]))
+    bias = camera["bias"]["moves"]
+    assert bias["motion_mm"] < 0.5 * bias["pose_mm"]  # the camera errs alike before and after
+
+
+def test_the_table_says_met_or_missed(report):
+    text = position_report.table(report)
+    assert text.count("| met |") == 2
+    assert "| 0.142 (0.32) |" in text
+    assert "5 registrations (ray casting): 5 accepted, 0 ambiguous, 0 rejected" in text
+    worse = copy.deepcopy(report)
+    for row in position_report.moves_of(worse["cameras"][0]):
+        row["against_probe_mm"] = 0.2
+    text = position_report.table(worse)
+    assert text.count("| met |") == 1
+    assert "| 0.692 (0.85) | 0.200 (0.200) | 0.1 | MISSED |" in text
+    for block in text.split("\n\n"):
+        counts = {line.count("|") for line in block.splitlines() if line.startswith("|")}
+        assert len(counts) <= 1
+
+
+def test_the_picture_is_figure_15(report, tmp_path):
+    figure = position_report.picture(report)
+    turned, moved = figure.axes
+    for axes, levels in ((turned, (0.142, 0.32, 0.05)), (moved, (0.692, 0.85, 0.1))):
+        flat = [line.get_ydata()[0] for line in axes.get_lines() if len(line.get_xdata()) == 2]
+        assert set(levels) <= set(flat)
+    drawn = next(line for line in turned.get_lines() if line.get_label() == "mean of the cameras")
+    wanted = [abs(row["error_deg"]) for row in position_report.turns_of(report["cameras"][0])]
+    np.testing.assert_allclose(drawn.get_ydata(), wanted)
+    save_figure(figure, tmp_path / "position.png")
+    assert (tmp_path / "position.png").stat().st_size > 20_000
+
+
+def test_arguments_that_make_no_sense_are_refused():
+    parser = make_parser()
+    assert parser.parse_args([]).positions == 12
+    for words, says in (
+        (["--positions", "2"], "at least 3"),
+        (["--positions", "20"], "from 2 to 12"),
+        (["--views", "999"], "numbers below 216"),
+    ):
+        with pytest.raises(InputError, match=says):
+            position.main(parser.parse_args(words))

@@ -1,0 +1,126 @@
+"""What virtual scans of one kind or another are worth on real ones, with networks given."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.runner.online import EndlessSettings
+from experiments.studies.sensor_transfer import study as sensor_transfer
+from experiments.studies.sensor_transfer.study import (
+    IDEAL,
+    NO_NETWORK,
+    main,
+    make_parser,
+    recipe,
+    table,
+)
+from vanejax.cad.parametric_vane import guide_vane
+from vanejax.scanner.camera import hemisphere_viewpoints
+from vanejax.scanner.measurement import measure
+from vanejax.scanner.sensor import preset
+from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scans.scan_file import save_points
+from vanejax.training.pretrained import shipped_weights
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One scan of the guide vane by a paper camera, in the place of a real one."""
+    folder = tmp_path_factory.mktemp("scans")
+    part = guide_vane()
+    part.export(folder / "part.stl")
+    pose = hemisphere_viewpoints(part.center).view(60)
+    sensor = preset("paper_camera").scaled(0.4)
+    save_points(
+        folder / "scan.ply",
+        measure(Scanner(part), sensor, pose, np.random.default_rng(0)).points,
+    )
+    entry = {
+        "scan": "scan.ply",
+        "cad": "part.stl",
+        "cad_unit_mm": 1.0,
+        "scan_units": "mm",
+        "scan_from_cad_mm": [pose.as_matrix().tolist()],
+    }
+    (folder / "ground_truth.json").write_text(json.dumps([entry]))
+    return folder
+
+
+def test_a_good_network_and_a_bad_one_are_told_apart(
+    folder: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    good = shipped_weights(guide_vane())
+    assert good is not None
+    # weights that know nothing: every feature alike
+    bad = dataclasses.replace(good, variables=_zeroed(good.variables))
+    asked = []
+
+    def network(config, place):
+        asked.append((config.endless.effects, place))
+        return good if config.endless.effects else bad
+
+    monkeypatch.setattr(sensor_transfer, "network", network)
+    arguments = [str(folder), "--out", str(tmp_path), "--starts", "3", "--steps", "7"]
+    report = main(make_parser().parse_args([*arguments, "--sensor", "paper_camera"]))
+    assert asked == [
+        (False, tmp_path / "part_ideal"),
+        (True, tmp_path / "part_paper_camera"),
+    ]
+    found = report["summary"]["all"]
+    assert found["paper_camera"]["alone"]["right"] == 1.0
+    assert found["paper_camera"]["alone"]["rotation_deg"] < 2
+    assert found[IDEAL]["alone"]["rotation_deg"] > 5
+    assert found["paper_camera"]["refined"]["rotation_deg"] < 0.1
+    assert 0 < found[NO_NETWORK]["alone"]["rotation_deg"] <= 45
+    assert report["summary"]["part"] == found
+    assert report["scans"] == {"scan.ply": found}
+    assert found[IDEAL]["alone"]["registrations"] == 3
+    assert json.loads((tmp_path / "sensor_transfer.json").read_text()) == report
+    printed = capsys.readouterr().out
+    assert table(report) in printed
+    assert "| paper_camera | all | 3 of 3 |" in printed
+
+
+def _zeroed(tree):
+    return {
+        name: _zeroed(leaf) if isinstance(leaf, dict) else np.zeros_like(leaf)
+        for name, leaf in tree.items()
+    }
+
+
+def test_two_trainings_differ_in_the_effects_alone(folder: Path) -> None:
+    (known,) = sensor_transfer.load_truth(folder)
+    real, ideal = (
+        recipe(known, "consumer_depth", effects=effects, steps=9, seed=4)
+        for effects in (True, False)
+    )
+    real.check()
+    assert (real.name, ideal.name) == ("part_consumer_depth", "part_ideal")
+    assert (real.endless.effects, ideal.endless.effects) == (True, False)
+    ideal.name, ideal.endless = real.name, dataclasses.replace(ideal.endless, effects=True)
+    assert ideal == real
+    assert real.endless.resolution == 1.0  # its own pixels
+
+
+def test_no_effects_leave_the_camera_and_nothing_of_the_sensor() -> None:
+    settings = EndlessSettings(sensor="consumer_depth", effects=False)
+    sensor, full = settings.kind(), preset("consumer_depth")
+    assert sensor.camera == full.camera
+    part = guide_vane()
+    pose = hemisphere_viewpoints(part.center).view(3)
+    rng = np.random.default_rng(0)
+    measured = measure(Scanner(part), sensor, pose, rng)
+    ideal = Scanner(part).scan(full.camera, pose)
+    np.testing.assert_array_equal(measured.points, ideal.points)
+    assert EndlessSettings(sensor="consumer_depth").kind() == full
+
+
+def test_a_sensor_that_is_none_is_refused(folder: Path, capsys) -> None:
+    with pytest.raises(SystemExit):
+        make_parser().parse_args([str(folder), "--sensor", "consumer"])
+    assert "no sensor 'consumer'" in capsys.readouterr().err

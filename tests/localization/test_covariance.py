@@ -1,0 +1,102 @@
+"""Covariance and weakest directions against linear algebra; correlated scores against their law."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from example_result import example_result
+from example_scans import ideal_scan, model, vane
+
+from vanejax.localization.covariance import PATCHES, inflation, patches_of, uncertainty
+from vanejax.localization.pose_result import Refinement
+from vanejax.localization.residuals import SurfaceMatching
+
+
+def refinement(information: np.ndarray) -> Refinement:
+    return dataclasses.replace(example_result().refinement, information=information)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_uncertainty_reads_the_covariance(seed):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(6, 6)) * np.repeat([1e-4, 1e-2], 3)[:, None]
+    covariance = root @ root.T
+    sure = uncertainty(refinement(np.linalg.inv(covariance)), np.array([1.0, 2.0, 3.0]))
+    np.testing.assert_allclose(sure.covariance, covariance, rtol=1e-6, atol=1e-14)
+    sigma = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(sure.rotation_sigma_deg, np.degrees(sigma[:3]), rtol=1e-6)
+    np.testing.assert_allclose(sure.translation_sigma_mm, sigma[3:], rtol=1e-6)
+    axis = sure.weakest_rotation_axis
+    assert axis[np.argmax(np.abs(axis))] > 0  # one name for each axis, whatever its sign
+    largest = np.degrees(np.sqrt(axis @ covariance[:3, :3] @ axis))
+    assert sure.weakest_rotation_sigma_deg == pytest.approx(largest)
+    assert largest >= sure.rotation_sigma_deg.max() - 1e-12
+    axis = sure.weakest_translation_axis
+    largest = np.sqrt(axis @ covariance[3:, 3:] @ axis)
+    assert sure.weakest_translation_sigma_mm == pytest.approx(largest)
+    assert axis[np.argmax(np.abs(axis))] > 0
+    np.testing.assert_array_equal(sure.center, [1, 2, 3])
+
+
+def test_what_is_not_known_at_all_is_half_a_turn_not_infinite():
+    information = np.diag([1e8, 1e8, 0.0, 1e4, 1e4, 0.0])
+    sure = uncertainty(refinement(information), np.zeros(3))
+    assert np.isfinite(sure.covariance).all()
+    assert sure.weakest_rotation_sigma_deg == pytest.approx(180)
+    assert sure.weakest_translation_sigma_mm == pytest.approx(100 * np.pi)
+    np.testing.assert_allclose(sure.weakest_rotation_axis, [0, 0, 1])
+    np.testing.assert_allclose(sure.weakest_translation_axis, [0, 0, 1])
+    assert sure.rotation_sigma_deg[0] == pytest.approx(np.degrees(1e-4))
+
+
+@pytest.mark.parametrize("rays", [True, False])
+def test_patches_are_small_and_of_one_place(rays):
+    scan, _ = ideal_scan(vane())
+    points = scan.points.astype(np.float64)
+    measured = model(vane()) if rays else SurfaceMatching(model(vane()).surface, 20.0)
+    labels = patches_of(measured, points)
+    assert len(labels) == len(PATCHES)
+    for label, across in zip(labels, PATCHES, strict=True):
+        assert label.shape == (len(points),)
+        assert 20 < label.max() + 1 <= across ** (2 if rays else 3)
+        place = points / -points[:, 2:] * 400 if rays else points
+        side = np.ptp(place, axis=0).max() / across
+        for one in range(0, label.max() + 1, 7):
+            # a square on a plane that is tilted a little to that of the image
+            assert np.ptp(place[label == one], axis=0).max() < 1.6 * side
+
+
+def scores(correlated: float, seed: int) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Scores [n, 6] of 8 x 8 blocks, with a share of their variance common to a block."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(64), np.arange(64))
+    coarse = ((x // 8) * 8 + y // 8).ravel()
+    fine = ((x // 4) * 16 + y // 4).ravel()
+    common = rng.normal(size=(64, 6))[coarse]
+    own = rng.normal(size=(4096, 6))
+    return np.sqrt(correlated) * common + np.sqrt(1 - correlated) * own, [fine, coarse]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_independent_scores_do_not_inflate(seed):
+    values, patches = scores(0.0, seed)
+    assert inflation(values.T @ values, values - values.mean(axis=0), patches) == 1.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_common_scores_inflate_by_the_design_effect(seed):
+    """Blocks of m alike points with correlation r: the variance of sums grows by 1 + (m - 1) r."""
+    values, patches = scores(0.2, seed)
+    found = inflation(values.T @ values, values - values.mean(axis=0), patches)
+    # 64 blocks: a variance ratio is good to sqrt(2 / 64) = 18 %, a median of six to some 10 %
+    assert found == pytest.approx(1 + 63 * 0.2, rel=0.4)
+
+
+def test_few_patches_say_nothing():
+    values, patches = scores(0.5, 0)
+    few = [patch // 4 for patch in patches][1:] * 2
+    assert few[0].max() < 19
+    assert inflation(values.T @ values, values, few) == 1.0
+    assert inflation(np.zeros((6, 6)), values, patches) == 1.0

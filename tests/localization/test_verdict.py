@@ -1,0 +1,204 @@
+"""Every verdict and every reason, each by a case built to reach it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from example_result import example_result, pose
+
+from vanejax.localization.pose_result import Verdict
+from vanejax.localization.verdict import Limits, Rival, judge
+
+RADIUS = 70.0
+GOOD = example_result()
+FAR = Rival(20.0, 180.0, 0.5, pose((180.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+
+
+def verdict(*, rivals=(FAR,), limits=None, uncertainty=None, **verification) -> Verdict:
+    """Of a result in which all is well but what is given."""
+    said = {
+        "inlier_share": 0.95,
+        "violation_share": 0.01,
+        "unmeasured_share": 0.03,
+        "tolerance_mm": 0.3,
+        "checked": np.arange(1000),
+    }
+    return judge(
+        GOOD.refinement,
+        dataclasses.replace(GOOD.verification, **(said | verification)),
+        dataclasses.replace(GOOD.uncertainty, **(uncertainty or {})),
+        rivals,
+        radius_mm=RADIUS,
+        limits=limits,
+    )
+
+
+def test_all_well_is_accepted_and_says_why():
+    found = verdict()
+    assert found.status == "accepted"
+    assert "95.0%" in found.reason
+    assert "0.3 mm" in found.reason
+    assert verdict(rivals=()).status == "accepted"
+
+
+REJECTED = {
+    "only 30 points": {"checked": np.arange(32)},
+    "only 40% of the points lie on the part (within 0.3 mm)": {"inlier_share": 0.4},
+    "30% of the points would have been seen through the part's material": {"violation_share": 0.3},
+    "50% of the surface that the sensor should have seen was not measured": {
+        "unmeasured_share": 0.5
+    },
+    "the points lie 3 mm off the surface": {"tolerance_mm": 9.0},
+}
+
+
+@pytest.mark.parametrize("reason", REJECTED)
+def test_each_fault_rejects_with_its_figure(reason):
+    found = verdict(**REJECTED[reason])
+    assert found.status == "rejected"
+    assert reason in found.reason
+
+
+@pytest.mark.parametrize(
+    ("field", "limit"),
+    [
+        ("inlier_share", Limits().least_inlier_share),
+        ("violation_share", Limits().most_violation_share),
+        ("unmeasured_share", Limits().most_unmeasured_share),
+    ],
+)
+def test_the_limit_itself_is_allowed(field, limit):
+    worse = -1 if field == "inlier_share" else 1
+    assert verdict(**{field: limit - worse * 1e-9}).status != "rejected"
+    assert verdict(**{field: limit + worse * 1e-6}).status == "rejected"
+
+
+def test_weak_support_is_no_certainty():
+    """Another part that shares a corner fits 83 % of the points, 79 % of the surface."""
+    assert verdict(inlier_share=0.83, unmeasured_share=0.15).status == "accepted"
+    found = verdict(inlier_share=0.83, unmeasured_share=0.21)
+    assert found.status == "ambiguous"
+    assert "only 83% of the points" in found.reason
+    assert "21% of the surface" in found.reason
+    unknown = verdict(inlier_share=0.65, violation_share=np.nan, unmeasured_share=np.nan)
+    assert unknown.status == "ambiguous"
+    assert "surface" not in unknown.reason
+    assert verdict(inlier_share=0.72, unmeasured_share=np.nan).status == "accepted"
+
+
+def test_noise_is_doubtful_first_and_then_a_fault():
+    limits = Limits()
+    doubtful, fault = (3 * share * RADIUS for share in (limits.doubtful_noise, limits.most_noise))
+    assert doubtful < fault
+    assert verdict(tolerance_mm=doubtful - 1e-9).status == "accepted"
+    found = verdict(tolerance_mm=doubtful + 1e-6)
+    assert found.status == "ambiguous"
+    assert "1.4 mm off the surface, 2.0% of the part's radius" in found.reason
+    assert verdict(tolerance_mm=fault - 1e-9).status == "ambiguous"
+    assert verdict(tolerance_mm=fault + 1e-6).status == "rejected"
+
+
+def test_few_inliers_are_counted_not_shared():
+    assert verdict(checked=np.arange(43), inlier_share=40 / 43).status == "accepted"
+    found = verdict(checked=np.arange(43), inlier_share=39 / 43)
+    assert found.status == "rejected"
+    assert found.reason == "only 39 points lie on the part"
+
+
+def test_the_worst_fault_comes_first():
+    found = verdict(inlier_share=0.1, violation_share=0.5, unmeasured_share=0.9)
+    assert found.reason.startswith("only 10% of the points")
+    assert verdict(violation_share=0.5, unmeasured_share=0.9).reason.startswith("50%")
+
+
+def test_unknown_shares_do_not_count():
+    """Without a sensor there is no violation and nothing unmeasured: NaN, and no fault."""
+    found = verdict(violation_share=np.nan, unmeasured_share=np.nan)
+    assert found.status == "accepted"
+
+
+def rival(preference: float, turn: float = 120.0, shift: float = 3.25) -> Rival:
+    return Rival(preference, turn, shift, FAR.part_from_camera)
+
+
+def test_a_rival_within_the_noise_is_ambiguous():
+    found = verdict(rivals=[FAR, rival(1.0)])
+    assert found.status == "ambiguous"
+    assert "another pose" in found.reason
+    assert "120.0 deg" in found.reason
+    assert "3.25 mm" in found.reason
+
+
+def test_the_nearest_rival_is_named_and_all_are_counted():
+    found = verdict(rivals=[rival(3.0, 90), FAR, rival(-0.5, 45), rival(2.0, 60)])
+    assert "3 other poses" in found.reason
+    assert "45.0 deg" in found.reason
+
+
+def test_a_rival_that_fits_better_is_called_so():
+    limit = Limits().least_preference
+    assert "another pose better: one is turned" in verdict(rivals=[rival(-limit - 0.1)]).reason
+    assert "another pose nearly as well" in verdict(rivals=[rival(-limit)]).reason
+
+
+def test_the_threshold_of_preference():
+    limit = Limits().least_preference
+    assert verdict(rivals=[rival(limit)]).status == "accepted"
+    assert verdict(rivals=[rival(limit - 1e-6)]).status == "ambiguous"
+
+
+def test_a_fault_outweighs_a_rival():
+    assert verdict(rivals=[rival(0.0)], inlier_share=0.1).status == "rejected"
+
+
+@pytest.mark.parametrize(
+    ("axis", "words"),
+    [
+        ([0.0, 0.0, 1.0], "the part's z"),
+        ([-1.0, 0.0, 0.0], "the part's x"),
+        ([0.0, 0.6, 0.8], "(0.00, 0.60, 0.80) in the part's frame"),
+    ],
+)
+def test_a_weak_direction_is_ambiguous_and_named(axis, words):
+    limits = Limits()
+    turn = {"weakest_rotation_axis": np.array(axis), "weakest_rotation_sigma_deg": 2.5}
+    found = verdict(uncertainty=turn)
+    assert found.status == "ambiguous"
+    assert f"about {words}: 2.50 deg" in found.reason
+    shift = {"weakest_translation_axis": np.array(axis), "weakest_translation_sigma_mm": 1.25}
+    found = verdict(uncertainty=shift)
+    assert found.status == "ambiguous"
+    assert f"along {words}: 1.25 mm" in found.reason
+    close = {
+        "weakest_rotation_sigma_deg": limits.most_rotation_sigma_deg,
+        "weakest_translation_sigma_mm": limits.most_translation_sigma * RADIUS,
+    }
+    assert verdict(uncertainty=close).status == "accepted"
+
+
+@pytest.mark.parametrize(
+    ("limits", "case"),
+    [
+        (Limits(least_inlier_share=0.99), {}),
+        (Limits(most_violation_share=0.001), {}),
+        (Limits(most_unmeasured_share=0.01), {}),
+        (Limits(most_noise=0.001), {}),
+        (Limits(doubtful_noise=0.001), {}),
+        (Limits(doubtful_noise=0.03), {"tolerance_mm": 3 * 0.025 * RADIUS}),
+        (Limits(least_inliers=2000), {}),
+        (Limits(least_preference=30.0), {}),
+        (Limits(most_rotation_sigma_deg=1e-4), {}),
+        (Limits(most_translation_sigma=1e-6), {}),
+        (Limits(least_support=0.99), {}),
+        (Limits(least_support=0.5), {"inlier_share": 0.62}),
+        (Limits(least_inlier_share=0.2, least_support=0.2), {"inlier_share": 0.3}),
+        (Limits(most_violation_share=0.5), {"violation_share": 0.4}),
+        (Limits(least_preference=-1.0), {"rivals": [rival(0.0)]}),
+    ],
+)
+def test_limits_are_respected(limits, case):
+    """Each turns the verdict that the defaults give."""
+    before, after = verdict(**case), verdict(**case, limits=limits)
+    assert (before.status == "accepted") != (after.status == "accepted")

@@ -1,0 +1,266 @@
+"""Poses in files: conventions against scipy, and every way a guess can be wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from example_result import example_result, pose
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from vanejax.errors import InputError
+from vanejax.machine.pose_file import (
+    euler_xyz_deg,
+    pose_to_dict,
+    quaternion_wxyz,
+    read_pose,
+    result_to_dict,
+    write_result,
+)
+from vanejax.matching import se3 as rigid
+from vanejax.rigid import RigidTransform
+
+NAMES = {"scan_name": "scan", "part_name": "vane", "part_sha256": "ab" * 32}
+ANGLE = st.floats(-180, 180)
+EXACT = {"rtol": 0, "atol": 1e-12}  # f64 eps times the largest translation, 400 mm, and a few more
+
+
+def strict(text: str) -> Any:
+    """JSON as its standard has it: without NaN and Infinity."""
+
+    def refuse(constant: str) -> float:
+        raise AssertionError(f"{constant} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def read(tmp_path: Path, content: Any, name: str = "pose.json") -> RigidTransform:
+    path = tmp_path / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return read_pose(path)
+
+
+@given(ANGLE, st.one_of(st.floats(-90, 90), st.sampled_from([-90.0, 90.0, 89.9999999])), ANGLE)
+def test_every_form_of_a_pose_is_the_same_pose(a: float, b: float, c: float) -> None:
+    truth = pose((a, b, c), (1.0, -2.0, 300.0))
+    found = pose_to_dict(truth)
+    matrix = truth.as_matrix()
+    np.testing.assert_array_equal(found["part_from_camera"], matrix)
+    np.testing.assert_allclose(
+        np.array(found["part_from_camera"]) @ found["camera_from_part"], np.eye(4), **EXACT
+    )
+    for name in ("part_from_camera", "camera_from_part"):
+        forms, matrix = found[f"{name}_as"], np.array(found[name])
+        kuka = forms["kuka"]
+        rotations = {
+            "quaternion": Rotation.from_quat(np.roll(forms["quaternion_wxyz"], -1)),
+            "euler": Rotation.from_euler("xyz", forms["euler_xyz_deg"], degrees=True),
+            # scipy's capitals turn about the moved axes: R = Rz(A) Ry(B) Rx(C)
+            "kuka": Rotation.from_euler("ZYX", [kuka[i] for i in "ABC"], degrees=True),
+        }
+        for form, rotation in rotations.items():
+            # near 90 deg the roots of nearly nothing keep half the digits
+            np.testing.assert_allclose(
+                rotation.as_matrix(), matrix[:3, :3], rtol=0, atol=1e-7, err_msg=form
+            )
+        np.testing.assert_array_equal(forms["translation_mm"], matrix[:3, 3])
+        np.testing.assert_array_equal([kuka[i] for i in "XYZ"], matrix[:3, 3])
+        assert forms["quaternion_wxyz"][0] >= 0
+
+
+def test_the_host_form_is_that_of_rigid() -> None:
+    angles = [(10, 20, 30), (-170, 80, 100), (20, 90, 30), (20, -90, 30), (180, 0, 180), (0, 0, 0)]
+    for rotation in Rotation.from_euler("xyz", angles, degrees=True).as_matrix():
+        theirs = np.asarray(rigid.euler_xyz_deg(rotation.astype(np.float32)))
+        # f32 eps times 180 deg, and an arc sine near 90 deg
+        np.testing.assert_allclose(
+            Rotation.from_euler("xyz", euler_xyz_deg(rotation), degrees=True).as_matrix(),
+            Rotation.from_euler("xyz", theirs, degrees=True).as_matrix(),
+            atol=1e-3,
+        )
+    assert euler_xyz_deg(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])).tolist() == [0, 90, 0]
+
+
+def test_a_half_turn_has_a_quaternion_without_loss() -> None:
+    for axis in np.eye(3):
+        rotation = Rotation.from_rotvec(np.pi * axis).as_matrix()
+        np.testing.assert_allclose(np.abs(quaternion_wxyz(rotation)[1:]), axis, atol=1e-12)
+
+
+def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "pose.json"
+    result = example_result("ambiguous")
+    write_result(path, result, **NAMES, seed=3, weights_name="vane.npz")
+    found = read_pose(path)
+    np.testing.assert_allclose(found.as_matrix(), result.part_from_camera.as_matrix(), **EXACT)
+    values = strict(path.read_text())
+    assert values["verdict"] == {"status": "ambiguous", "reason": "made up to be ambiguous"}
+    assert values["part"] == {"name": "vane", "sha256": "ab" * 32}
+    assert values["scan"] == {"name": "scan", "sensor_origin_mm": [0.0, 0.0, 0.0]}
+    assert (values["seed"], values["weights"]) == (3, "vane.npz")
+    assert np.shape(values["uncertainty"]["covariance"]) == (6, 6)
+    assert values["uncertainty"]["weakest_translation"] == {
+        "axis": [0.0, 0.6, 0.8],
+        "sigma_mm": 0.0061,
+    }
+    assert values["verification"]["points"] == {"inlier": 6, "before": 0, "behind": 1, "beside": 1}
+    assert values["refinement"]["noise_mm"] == 0.1012
+    (other,) = values["alternatives"]
+    assert other["rotation_from_the_answer_deg"] == 180.0
+    np.testing.assert_array_equal(
+        other["part_from_camera"], result.alternatives[0].part_from_camera.as_matrix()
+    )
+    assert values["notes"] == ["2 points were dropped"]
+    assert values["seconds"] == {"search": 1.25, "refinement": 0.5}
+    assert "row-major" in values["conventions"]["part_from_camera"]
+    assert "Rz(A) Ry(B) Rx(C)" in values["conventions"]["kuka"]
+    assert values["versions"]["numpy"] == np.__version__
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_not_known_is_null_not_nan(tmp_path: Path) -> None:
+    result = example_result(sensor=False)
+    uncertainty = dataclasses.replace(result.uncertainty, covariance=np.full((6, 6), np.inf))
+    write_result(
+        tmp_path / "pose.json", dataclasses.replace(result, uncertainty=uncertainty), **NAMES
+    )
+    values = strict((tmp_path / "pose.json").read_text())
+    assert values["verification"]["violation_share"] is None
+    assert values["verification"]["unmeasured_share"] is None
+    assert values["verification"]["inlier_share"] == 0.75
+    assert values["scan"]["sensor_origin_mm"] is None
+    assert values["uncertainty"]["covariance"][0] == [None] * 6
+    assert result_to_dict(result, **NAMES)["refinement"]["converged"] is True
+
+
+def test_every_way_to_write_a_guess(tmp_path: Path) -> None:
+    truth = pose((10.0, -20.0, 30.0), (1.5, -2.25, 400.125))
+    matrix = truth.as_matrix().tolist()
+    inverse = truth.inverse().as_matrix().tolist()
+    flat = [number for row in matrix for number in row]
+    rows = "\n".join(" ".join(map(repr, row)) for row in matrix)
+    contents = {
+        "own.json": {"part_from_camera": matrix, "camera_from_part": inverse, "note": 1},
+        "nested.json": {"part_from_camera": {"matrix": matrix}},
+        "inverse.json": {"camera_from_part": inverse},
+        "bare.json": matrix,
+        "flat.json": flat,
+        "bom.json": "\ufeff" + json.dumps(matrix),
+        "rows.txt": f"# by hand\n{rows}  # the last row\n",
+        "commas.csv": ",".join(map(repr, flat)),
+        "semicolons.csv": rows.replace(" ", ";"),
+        "list.txt": json.dumps(flat),
+    }
+    for name, content in contents.items():
+        found = read(tmp_path, content, name)
+        assert found.rotation.dtype == found.translation.dtype == np.float64
+        np.testing.assert_allclose(found.as_matrix(), matrix, err_msg=name, **EXACT)
+
+
+@given(st.lists(st.floats(-4e-4, 4e-4), min_size=9, max_size=9), ANGLE, ANGLE)
+def test_a_rounded_matrix_becomes_the_nearest_rotation(
+    noise: list[float], a: float, c: float
+) -> None:
+    from vanejax.machine.pose_file import rigid_from_matrix
+
+    truth = pose((a, 25.0, c), (0.0, 0.0, 100.0))
+    rough = truth.as_matrix()
+    rough[:3, :3] += np.reshape(noise, (3, 3))
+    gram = rough[:3, :3].T @ rough[:3, :3]
+    if np.abs(gram - np.eye(3)).max() > 1e-3:
+        with pytest.raises(InputError, match="no rotation"):
+            rigid_from_matrix(rough, where="here")
+        return
+    found = rigid_from_matrix(rough, where="here").rotation
+    np.testing.assert_allclose(found.T @ found, np.eye(3), atol=1e-14)
+    assert np.linalg.det(found) > 0
+    # no rotation of a small neighbourhood is nearer, in the sense of Frobenius
+    best = np.linalg.norm(found - rough[:3, :3])
+    for turn in 1e-4 * np.concatenate([np.eye(3), -np.eye(3)]):
+        other = Rotation.from_rotvec(turn).as_matrix() @ found
+        assert np.linalg.norm(other - rough[:3, :3]) > best
+
+
+def changed(row: int, column: int, value: Any) -> list[list[Any]]:
+    matrix = np.eye(4).tolist()
+    matrix[row][column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"pose": np.eye(4).tolist()}, "no \"part_from_camera\".*has 'pose'"),
+        ({}, "it has nothing"),
+        ("[1, 2", "not valid JSON"),
+        ("[" * 100_000, "not valid JSON"),
+        ("", "holds 0 numbers"),
+        ("1 2 3", "holds 3 numbers"),
+        (" ".join(["0"] * 17), "holds 17 numbers"),
+        ("hello", "neither JSON nor 16 numbers"),
+        ("nan " * 16, "not finite"),
+        (np.eye(3).tolist(), "no 4x4 matrix"),
+        (changed(0, 3, "1"), "no 4x4 matrix"),
+        (changed(0, 3, None), "no 4x4 matrix"),
+        (changed(0, 3, True), "no 4x4 matrix"),
+        (changed(0, 3, 10**400), "not finite"),
+        ({"part_from_camera": "identity"}, "part_from_camera: holds no 4x4 matrix"),
+        (changed(3, 3, 2.0), r"last row is \[0.0, 0.0, 0.0, 2.0\]"),
+        (changed(3, 0, 100.0), "column-major: transpose"),
+        (changed(0, 3, float("nan")), "not finite"),
+        (changed(0, 3, float("inf")), "not finite"),
+        (changed(0, 0, -1.0), "mirror image"),
+        (changed(0, 1, 0.01), "axes are not unit and square.*by 0.01"),
+        (changed(0, 0, 1e200), "entry of size 1e[+]200"),
+        (np.diag([1000.0, 1000, 1000, 1]).tolist(), "scales by 1000"),
+        (np.diag([0.0, 0, 0, 1]).tolist(), "axes are not unit"),
+        (
+            {"part_from_camera": changed(0, 3, 5.0), "camera_from_part": changed(0, 3, 5.0)},
+            "not inverse to each other",
+        ),
+    ],
+)
+def test_what_is_no_pose_is_named(tmp_path: Path, content: Any, words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        read(tmp_path, content)
+    assert str(caught.value).startswith(str(tmp_path / "pose.json"))
+
+
+def test_what_is_no_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_pose(tmp_path / "none.json")
+    with pytest.raises(InputError, match="is a folder"):
+        read_pose(tmp_path)
+    with pytest.raises(InputError, match="or a device"):
+        read_pose("/dev/zero")
+    (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\xff\xfe\x00")
+    with pytest.raises(InputError, match="is no text"):
+        read_pose(tmp_path / "picture.png")
+    with open(tmp_path / "large.json", "wb") as file:
+        file.truncate(1 << 30)
+    with pytest.raises(InputError, match="1024 MiB are too large"):
+        read_pose(tmp_path / "large.json")
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=5)
+        | st.dictionaries(st.sampled_from(["part_from_camera", "matrix", "x"]), inner, max_size=3)
+    ),
+)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(JSON.map(lambda value: json.dumps(value).encode()) | st.binary(max_size=50))
+def test_nothing_but_an_input_error_comes_of_rubbish(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "rubbish"
+    path.write_bytes(content)
+    with pytest.raises(InputError):
+        read_pose(path)

@@ -1,0 +1,325 @@
+"""Motions between registrations: laws, the equations of the paper, errors against Monte Carlo."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from vanejax.errors import InputError
+from vanejax.machine.positioning import (
+    Screw,
+    angle_sigma_deg,
+    camera_motion,
+    common_axis,
+    displacement,
+    displacement_covariance,
+    in_machine,
+    motion_errors,
+    probe_motion,
+    probe_translation,
+    recentred,
+    screw_of,
+    twist_about,
+    twist_gradient,
+    wrapped_deg,
+)
+from vanejax.rigid import RigidTransform
+
+CENTER = np.array([5.0, -3.0, 20.0])
+
+
+def pose(rng: np.random.Generator, reach: float = 300.0) -> RigidTransform:
+    return RigidTransform(Rotation.random(rng=rng).as_matrix(), reach * rng.standard_normal(3))
+
+
+def small(e: np.ndarray, center: np.ndarray) -> RigidTransform:
+    """The small motion ``x -> c + exp(w) (x - c) + v``."""
+    rotation = Rotation.from_rotvec(e[:3]).as_matrix()
+    return RigidTransform(rotation, center - rotation @ center + e[3:])
+
+
+def error_of(found: RigidTransform, truth: RigidTransform, center: np.ndarray) -> np.ndarray:
+    left = truth @ found.inverse()
+    shift = left.rotation @ center + left.translation - center
+    return np.concatenate([Rotation.from_matrix(left.rotation).as_rotvec(), shift])
+
+
+def test_the_motion_is_what_the_camera_sees_the_part_do():
+    rng = np.random.default_rng(0)
+    part_from_camera, moved = pose(rng), pose(rng)
+    on_part = rng.standard_normal((7, 3)) * 50
+    seen_before, seen_after = (p.inverse().apply(on_part) for p in (part_from_camera, moved))
+    motion = camera_motion(part_from_camera, moved)
+    np.testing.assert_allclose(motion.apply(seen_before), seen_after, atol=1e-9)
+    # the paper's T2 T1^-1, T from the model to the scan; the other order is another motion
+    model_to_scan = [p.inverse() for p in (part_from_camera, moved)]
+    printed = model_to_scan[1] @ model_to_scan[0].inverse()
+    np.testing.assert_allclose(printed.as_matrix(), motion.as_matrix(), atol=1e-9)
+    other = (moved @ part_from_camera.inverse()).as_matrix()
+    assert np.abs(other - motion.as_matrix()).max() > 0.1
+
+
+def test_a_stage_that_turns_by_an_angle_is_seen_to_turn_by_it():
+    """About its own axis, with its sign, wherever the camera stands."""
+    rng = np.random.default_rng(1)
+    stage = Screw(np.array([0.0, 0.0, 1.0]), 30.0, np.array([10.0, 20.0, 0.0]), 0.0).motion
+    camera_from_stage, stage_from_part = pose(rng), pose(rng)
+    start = (camera_from_stage @ stage_from_part).inverse()
+    end = (camera_from_stage @ stage @ stage_from_part).inverse()
+    seen = screw_of(camera_motion(start, end))
+    assert seen.angle_deg == pytest.approx(30.0, abs=1e-9)
+    np.testing.assert_allclose(seen.axis, camera_from_stage.rotation[:, 2], atol=1e-12)
+    back = in_machine(camera_motion(start, end), camera_from_stage.inverse())
+    np.testing.assert_allclose(back.as_matrix(), stage.as_matrix(), atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 1e-3, 1.0, 90.0, 179.9999, 180.0])
+@pytest.mark.parametrize("along", [-4.0, 0.0])
+def test_a_motion_is_its_screw(angle, along):
+    rng = np.random.default_rng(2)
+    axis = rng.standard_normal(3)
+    axis /= np.linalg.norm(axis)
+    point = np.cross(axis, [10.0, -20.0, 5.0])
+    motion = Screw(axis, angle, point, along).motion
+    found = screw_of(motion)
+    # an axis known to 1e-16 / angle carries that far: 1e-7 deg is 2e-9 rad
+    np.testing.assert_allclose(found.motion.as_matrix(), motion.as_matrix(), atol=1e-7)
+    assert found.angle_deg == pytest.approx(angle, abs=1e-9)
+    if angle > 1e-4:
+        sign = np.sign(found.axis @ axis)
+        assert sign > 0 or angle == 180.0
+        np.testing.assert_allclose(sign * found.axis, axis, atol=1e-9)
+        np.testing.assert_allclose(found.point, point, atol=1e-6)
+        assert sign * found.along_mm == pytest.approx(along, abs=1e-9)
+        assert sign * found.pitch_mm == pytest.approx(360 * along / angle, rel=1e-9, abs=1e-9)
+    if not angle:
+        assert found.along_mm == pytest.approx(abs(along))
+        assert found.pitch_mm == np.inf
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    turn=st.floats(-179.9, 180.0),
+    swing=st.floats(0.0, 170.0),
+    direction=st.floats(0.0, 360.0),
+    seed=st.integers(0, 100),
+)
+def test_a_turn_then_a_swing_are_told_apart(turn, swing, direction, seed):
+    frame = Rotation.random(rng=np.random.default_rng(seed))
+    axis, across = frame.apply([[0, 0, 1], [np.cos(direction), np.sin(direction), 0]])
+    twist = Rotation.from_rotvec(np.radians(turn) * axis)
+    rotation = (Rotation.from_rotvec(np.radians(swing) * across) * twist).as_matrix()
+    found = twist_about(rotation, 3 * axis)
+    assert wrapped_deg(found.angle_deg - turn) == pytest.approx(0, abs=1e-6)
+    assert found.swing_deg == pytest.approx(swing, abs=1e-6)
+    # nearest: no neighbour on the axis leaves less
+    for beside in (-0.5, 0.5):
+        other = Rotation.from_rotvec(np.radians(turn + beside) * axis)
+        left = (Rotation.from_matrix(rotation) * other.inv()).magnitude()
+        assert np.degrees(left) > found.swing_deg - 1e-9
+
+
+@pytest.mark.parametrize("swing", [1e-9, 1e-6, 1e-3])
+def test_a_tiny_swing_keeps_its_digits(swing):
+    rotation = Rotation.from_rotvec([np.radians(swing), 0, 0]).as_matrix()
+    assert twist_about(rotation, np.array([0, 0, 1])).swing_deg == pytest.approx(swing, rel=1e-5)
+
+
+def test_angles_wrap():
+    np.testing.assert_allclose(
+        wrapped_deg(np.array([180, -180, 181, 359, -190])), [180, 180, -179, -1, 170]
+    )
+
+
+def test_no_angle_where_there_is_none():
+    flip = np.diag([1.0, -1.0, -1.0])
+    with pytest.raises(InputError, match="turns the axis round"):
+        twist_about(flip, np.array([0, 0, 1]))
+    with pytest.raises(InputError, match="direction"):
+        twist_about(np.eye(3), np.zeros(3))
+
+
+def test_the_stage_axis_is_found_from_its_turns():
+    rng = np.random.default_rng(3)
+    axis = np.array([0.6, 0.0, 0.8])
+    turns = np.radians(np.arange(30, 331, 30))[:, None] * axis
+    noisy = Rotation.from_rotvec(1e-4 * rng.standard_normal((11, 3))) * Rotation.from_rotvec(turns)
+    found = common_axis(noisy.as_matrix())
+    assert np.degrees(np.arccos(abs(found @ axis))) < 0.01
+    few = Rotation.from_rotvec(turns[:3]).as_matrix()
+    np.testing.assert_allclose(common_axis(few), axis, atol=1e-12)
+    np.testing.assert_allclose(common_axis(few.swapaxes(1, 2)), -axis, atol=1e-12)
+    for nothing in (np.eye(3)[None], np.zeros((0, 3, 3))):
+        with pytest.raises(InputError, match="axis"):
+            common_axis(nothing)
+
+
+def test_the_probe_tells_the_way_there():
+    before = np.array([[0.0, 0, 0], [100, 0, 0], [0, 80, 0], [100, 80, 5]])
+    after = before + np.array([10.0, -2.0, 3.0])
+    np.testing.assert_allclose(probe_translation(before, after), [10, -2, 3])
+    found = probe_motion(before, after)
+    np.testing.assert_allclose(found.motion.translation, [10, -2, 3], atol=1e-9)
+    assert found.rms_mm == pytest.approx(0, abs=1e-9)
+    # a stage that turns: the mean of the points is not how the origin moves
+    turn = Screw(np.array([0.0, 0, 1]), 2.0, np.array([500.0, 0, 0]), 1.0).motion
+    np.testing.assert_allclose(
+        probe_motion(before, turn.apply(before)).motion.as_matrix(), turn.as_matrix(), atol=1e-9
+    )
+
+
+def test_the_probe_knows_its_noise():
+    rng = np.random.default_rng(4)
+    before = np.array([[0.0, 0, 0], [100, 0, 0], [0, 80, 0], [100, 80, 5]])
+    rms = [
+        probe_motion(before, before + 0.015 * rng.standard_normal((4, 3))).rms_mm
+        for _ in range(400)
+    ]
+    assert np.sqrt(np.mean(np.square(rms))) == pytest.approx(
+        0.015, rel=0.1
+    )  # 2,400 freedoms: 1.5 %
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        (np.zeros((4, 3)), np.zeros((3, 3)), "same before and after"),
+        (np.zeros((2, 3)), np.zeros((2, 3)), "too few"),
+        (np.outer(np.arange(4), [1, 2, 3]), np.zeros((4, 3)), "one line"),
+        (np.full((4, 3), np.nan), np.zeros((4, 3)), "finite"),
+    ],
+)
+def test_points_that_fix_no_motion_are_refused(before, after, says):
+    with pytest.raises(InputError, match=says):
+        probe_motion(before, after)
+
+
+def test_a_small_motion_is_the_same_about_any_centre():
+    rng = np.random.default_rng(5)
+    e = 1e-7 * rng.standard_normal(6)
+    old, new = 100 * rng.standard_normal((2, 3))
+    there = recentred(old, new) @ e
+    # second order: |e|^2 times the way
+    np.testing.assert_allclose(small(e, old).as_matrix(), small(there, new).as_matrix(), atol=1e-11)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_jacobians_are_those_of_small_errors(seed):
+    """Forward differences of the true motion by each of the 18 errors."""
+    rng = np.random.default_rng(seed)
+    before, after, machine = pose(rng), pose(rng), pose(rng, 1000.0)
+    place = 500 * rng.standard_normal(3)
+    errors = motion_errors(
+        before, after, CENTER, machine_from_camera=machine, calibration_center=place
+    )
+    found = in_machine(camera_motion(before, after), machine)
+    arrived = in_machine(camera_motion(before, after), machine).apply(
+        (machine @ before.inverse()).apply(CENTER[None])
+    )
+    np.testing.assert_allclose(errors.center, arrived[0], atol=1e-8)
+    step = 1e-6
+    for k, way in enumerate((errors.of_before, errors.of_after, errors.of_calibration)):
+        columns = []
+        for i in range(6):
+            e = [np.zeros(6), np.zeros(6), np.zeros(6)]
+            e[k][i] = step
+            truth = in_machine(
+                camera_motion(small(e[0], CENTER) @ before, small(e[1], CENTER) @ after),
+                small(e[2], place) @ machine,
+            )
+            columns.append(error_of(found, truth, errors.center) / step)
+        # second order: the step times 1000 mm of lever
+        np.testing.assert_allclose(np.stack(columns, axis=1), way, atol=5e-3)
+
+
+def test_sigmas_of_the_figures_are_those_of_a_monte_carlo():
+    rng = np.random.default_rng(6)
+    before, machine = pose(rng), pose(rng, 1000.0)
+    axis = np.array([0.0, 0.6, 0.8])
+    turn = Rotation.from_rotvec(np.radians(40) * axis) * Rotation.from_rotvec([0.05, 0, 0])
+    after = before @ RigidTransform(turn.as_matrix(), np.array([5.0, 2, 30])).inverse()
+    place = 500 * rng.standard_normal(3)
+    roots = [
+        rng.standard_normal((6, 6)) * np.repeat([scale, 100 * scale], 3)[:, None]
+        for scale in (2e-4, 1e-4, 3e-4)
+    ]
+    errors = motion_errors(
+        before, after, CENTER, machine_from_camera=machine, calibration_center=place
+    )
+    covariance = errors.covariance(*(root @ root.T for root in roots))
+    found = in_machine(camera_motion(before, after), machine)
+    seen_axis = machine.rotation @ axis
+    start = (machine @ before.inverse()).apply(CENTER[None])[0]
+    # what the machine's origin does counts the lever: the printed translation of eq. 13
+    spots = (start, np.zeros(3))
+    angles, shifts = [], ([], [])
+    for _ in range(3000):
+        e = [root @ rng.standard_normal(6) for root in roots]
+        truth = in_machine(
+            camera_motion(small(e[0], CENTER) @ before, small(e[1], CENTER) @ after),
+            small(e[2], place) @ machine,
+        )
+        angles.append(twist_about(truth.rotation, seen_axis).angle_deg)
+        for spot, values in zip(spots, shifts, strict=True):
+            values.append(displacement(truth, spot))
+    # 3,000 draws tell a deviation to 1.3 %
+    assert angle_sigma_deg(covariance, found.rotation, seen_axis) == pytest.approx(
+        np.std(angles), rel=0.06
+    )
+    for spot, values in zip(spots, shifts, strict=True):
+        arrived = spot + displacement(found, spot)
+        expected = displacement_covariance(covariance, errors.center, arrived)
+        drawn = np.cov(np.array(values).T)
+        np.testing.assert_allclose(drawn, expected, atol=0.08 * np.trace(expected))
+
+
+def test_a_known_frame_and_the_camera_itself():
+    rng = np.random.default_rng(7)
+    before, after = pose(rng), pose(rng)
+    errors = motion_errors(before, after, CENTER)
+    np.testing.assert_allclose(errors.of_before[:3, :3], after.rotation.T, atol=1e-12)
+    np.testing.assert_array_equal(errors.of_after, -errors.of_before)
+    one, two = np.diag([1e-8] * 3 + [1e-4] * 3), np.diag([2e-8] * 3 + [1e-4] * 3)
+    known = errors.covariance(one, two)
+    np.testing.assert_allclose(known, np.diag([3e-8] * 3 + [2e-4] * 3), atol=1e-15)
+    assert np.trace(errors.covariance(one, two, one)) > np.trace(known)
+
+
+def test_what_both_registrations_share_cancels():
+    rng = np.random.default_rng(8)
+    before, after = pose(rng), pose(rng)
+    errors = motion_errors(before, after, CENTER)
+    cause = rng.standard_normal((6, 4))
+    np.testing.assert_allclose(errors.common(cause, cause), 0, atol=1e-12)
+    single = errors.common(cause, 0 * cause)
+    np.testing.assert_allclose(
+        single @ single.T, errors.covariance(cause @ cause.T, np.zeros((6, 6)))
+    )
+    with_frame = errors.common(cause, cause, cause)
+    np.testing.assert_allclose(with_frame, errors.of_calibration @ cause, atol=1e-9)
+
+
+def test_a_rotation_about_the_axis_counts_errors_along_it_only():
+    axis = np.array([0.0, 0.0, 1.0])
+    rotation = Rotation.from_rotvec([0, 0, 1.2]).as_matrix()
+    np.testing.assert_allclose(twist_gradient(rotation, axis), axis, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_gradient_of_the_angle_is_its_difference(seed):
+    """Also of rotations far off the axis, whose swing turns the gradient."""
+    rng = np.random.default_rng(seed)
+    rotation, axis = Rotation.random(rng=rng), rng.standard_normal(3)
+    step = 1e-6
+    columns = []
+    for w in step * np.eye(3):
+        angles = [
+            twist_about((Rotation.from_rotvec(side * w) * rotation).as_matrix(), axis).angle_deg
+            for side in (-1, 1)
+        ]
+        columns.append(np.radians(wrapped_deg(angles[1] - angles[0])) / (2 * step))
+    gradient = twist_gradient(rotation.as_matrix(), axis)
+    np.testing.assert_allclose(columns, gradient, rtol=1e-6, atol=1e-8)

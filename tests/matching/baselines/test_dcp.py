@@ -1,0 +1,282 @@
+"""DCP: its head against plain numpy, padding, order, and the contract."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.special
+from scipy.spatial.transform import Rotation
+
+from vanejax.matching.baselines.dcp import Dcp, dcp, last_match
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+
+N = M = 24
+MODEL = Dcp(width=32, num_neighbors=5, heads=2, hidden=16)
+EXACT = 1e-9  # f64 eps x the network's condition of about 1e5
+# these networks run for milliseconds: a fifth of the time to compile is worth slower code
+jit = functools.partial(
+    jax.jit,
+    compiler_options={"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
+)
+
+
+def problem() -> tuple[np.ndarray, np.ndarray]:
+    """Two samples of a bumpy sphere, the first moved; f64."""
+    normals = np.random.default_rng(0).normal(size=(N + M, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    xyz = normals * (0.6 + 0.2 * np.sin(5 * normals[:, :1]))
+    turn = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
+    return xyz[:N] @ turn.T + [0.1, 0, -0.1], xyz[N:]
+
+
+def cloud(xyz: np.ndarray, rows: int | None = None, junk: float = 0.3) -> PointCloud:
+    """A cloud whose padding lies scattered among the real points."""
+    rows = len(xyz) if rows is None else rows
+    place = np.sort(np.random.default_rng(rows).permutation(rows)[: len(xyz)])
+    full = np.full((rows, 3), junk, xyz.dtype)
+    full[place] = xyz
+    return PointCloud(xyz=full, normals=full, mask=np.isin(np.arange(rows), place))
+
+
+@functools.cache
+def exact_variables() -> dict:
+    """Random weights whose pointer is neither flat nor a choice of one."""
+    rng = np.random.default_rng(1)
+    xyz, target = (cloud(points.astype(np.float32)) for points in problem())
+    made = jax.eval_shape(
+        lambda *args: MODEL.init(*args, 1),
+        jax.random.key(0),
+        xyz,
+        target,
+        RigidTransform.identity(),
+    )
+    return jax.tree.map(lambda leaf: 0.7 * rng.normal(size=leaf.shape), made)
+
+
+def single(tree):
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), tree)
+
+
+@functools.partial(jit, static_argnames="iterations")
+def _run(variables, source, target, init, iterations):
+    return MODEL.apply(variables, source, target, init, iterations)
+
+
+def run(variables, source, target, init=None, iterations=1):
+    init = RigidTransform(np.eye(3), np.zeros(3)) if init is None else init
+    return _run(variables, source, target, init, iterations)
+
+
+@pytest.fixture
+def _double():
+    with jax.enable_x64(True):
+        yield
+
+
+def kabsch(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """target_from_source [4, 4] by scipy."""
+    a, b = source.mean(axis=0), target.mean(axis=0)
+    turn, _ = Rotation.align_vectors(target - b, source - a)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn.as_matrix(), b - turn.as_matrix() @ a
+    return pose
+
+
+@pytest.mark.usefixtures("_double")
+def test_scores_pointer_partners_and_pose_from_the_two_networks():
+    """Phi = F + transformer(F, other) both ways, softmax(phi phi^T / sqrt(width)), Kabsch."""
+    xyz, target_xyz = problem()
+    source, target = cloud(xyz), cloud(target_xyz)
+
+    @jit
+    def both(variables, source, target):
+        networks = MODEL.bind(variables)
+        f, g = (networks.dgcnn(c.xyz, c.mask) for c in (source, target))
+        of_source = f + networks.transformer(f, source.mask, g, target.mask)
+        return of_source, g + networks.transformer(g, target.mask, f, source.mask)
+
+    of_source, of_target = both(exact_variables(), source, target)
+    scores = np.asarray(of_source) @ np.asarray(of_target).T / np.sqrt(MODEL.width)
+    pointer = scipy.special.softmax(scores, axis=1)
+    (found,) = run(exact_variables(), source, target)
+    np.testing.assert_allclose(found.scores, scores, atol=EXACT)
+    np.testing.assert_allclose(np.exp(found.log_assignment), pointer, atol=EXACT)
+    np.testing.assert_allclose(found.partners, pointer @ target_xyz, atol=EXACT)
+    expected = kabsch(xyz, pointer @ target_xyz)
+    np.testing.assert_allclose(found.target_from_source.as_matrix(), expected, atol=1e-7)
+    # a pointer in which something happens: rows differ, none is flat
+    assert np.ptp(pointer, axis=0).max() > 0.1
+
+
+@pytest.mark.usefixtures("_double")
+@pytest.mark.parametrize("junk", [0.0, 50.0])
+def test_padding_changes_nothing(junk):
+    xyz, target_xyz = problem()
+    (plain,) = run(exact_variables(), cloud(xyz), cloud(target_xyz))
+    source, target = cloud(xyz, N + 9, junk), cloud(target_xyz, M + 11, -junk)
+    (found,) = run(exact_variables(), source, target)
+    pose = found.target_from_source.as_matrix()
+    np.testing.assert_allclose(pose, plain.target_from_source.as_matrix(), atol=1e-7)
+    scores = found.scores[source.mask][:, target.mask]
+    np.testing.assert_allclose(scores, plain.scores, atol=EXACT)
+    pointer = np.exp(found.log_assignment)[source.mask]
+    np.testing.assert_allclose(pointer[:, target.mask].sum(axis=1), 1, atol=EXACT)
+    np.testing.assert_array_equal(pointer[:, ~target.mask], 0)
+
+
+@pytest.mark.usefixtures("_double")
+def test_order_of_points_does_not_matter():
+    xyz, target_xyz = problem()
+    rng = np.random.default_rng(2)
+    rows, columns = rng.permutation(N), rng.permutation(M)
+    (plain,) = run(exact_variables(), cloud(xyz), cloud(target_xyz))
+    (mixed,) = run(exact_variables(), cloud(xyz[rows]), cloud(target_xyz[columns]))
+    np.testing.assert_allclose(mixed.scores, plain.scores[rows][:, columns], atol=EXACT)
+    np.testing.assert_allclose(
+        mixed.target_from_source.as_matrix(), plain.target_from_source.as_matrix(), atol=1e-7
+    )
+
+
+@pytest.mark.usefixtures("_double")
+def test_swapped_clouds_have_the_scores_transposed():
+    """One network serves both directions."""
+    xyz, target_xyz = problem()
+    (there,) = run(exact_variables(), cloud(xyz), cloud(target_xyz))
+    (back,) = run(exact_variables(), cloud(target_xyz), cloud(xyz))
+    np.testing.assert_allclose(back.scores, there.scores.T, atol=EXACT)
+
+
+@pytest.mark.usefixtures("_double")
+def test_a_second_iteration_and_a_start_elsewhere_are_the_moved_source():
+    xyz, target_xyz = problem()
+    source, target = cloud(xyz), cloud(target_xyz)
+    first, second = run(exact_variables(), source, target, iterations=2)
+    pose = first.target_from_source
+    moved = cloud(xyz @ np.asarray(pose.rotation).T + np.asarray(pose.translation))
+    (rest,) = run(exact_variables(), moved, target)
+    total = (rest.target_from_source @ pose).as_matrix()
+    np.testing.assert_allclose(second.target_from_source.as_matrix(), total, atol=1e-7)
+    (again,) = run(exact_variables(), source, target, jax.tree.map(np.asarray, pose))
+    np.testing.assert_allclose(again.target_from_source.as_matrix(), total, atol=1e-7)
+    assert np.abs(total - pose.as_matrix()).max() > 1e-3
+
+
+@pytest.mark.usefixtures("_double")
+def test_the_last_match_is_the_last_of_all_and_shares_the_reference():
+    source, target = (cloud(points) for points in problem())
+    variables, init = exact_variables(), RigidTransform(np.eye(3), np.zeros(3))
+    expected = run(variables, source, target, init, 2)[-1]
+    shared = jit(functools.partial(MODEL.apply, method="embed"))(variables, target)
+    last = jit(functools.partial(last_match, MODEL, iterations=2))
+    found = last(variables, source, target, init, target_embedding=shared)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-7)
+
+
+# ---- the contract ----
+
+
+@functools.cache
+def jitted():
+    return jit(dcp(MODEL, single(exact_variables())))
+
+
+def starts(count: int) -> RigidTransform:
+    rng = np.random.default_rng(0)
+    rotation = Rotation.random(count, rng=rng).as_matrix().astype(np.float32)
+    return RigidTransform(rotation, rng.normal(size=(count, 3), scale=0.1).astype(np.float32))
+
+
+def test_register_under_vmap_is_the_loop():
+    xyz, target_xyz = single(problem())
+    sources = [cloud(xyz[:size], N) for size in (N, N - 7, 12)]
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *sources)
+    target, inits, keys = cloud(target_xyz), starts(3), jax.random.split(jax.random.key(0), 3)
+    register = jit(jax.vmap(dcp(MODEL, single(exact_variables())), in_axes=(0, None, 0, 0)))
+    batched = register(batch, target, inits, keys)
+    for index in range(3):
+        init = jax.tree.map(lambda leaf, index=index: leaf[index], inits)
+        one = jitted()(sources[index], target, init, keys[index])
+        assert one.converged.shape == one.rmse.shape == one.overlap.shape == ()
+        assert one.iterations == 1
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(batched), strict=True):
+            np.testing.assert_allclose(a, b[index], atol=1e-3)  # f32 eps x the condition of 1e4
+
+
+def test_registration_says_what_it_rests_on():
+    xyz, target_xyz = single(problem())
+    source, target = cloud(xyz, N), cloud(target_xyz)
+    result = jitted()(source, target, RigidTransform.identity(), jax.random.key(0))
+    with jax.enable_x64(True):
+        (want,) = run(exact_variables(), *(cloud(points) for points in problem()))
+    want = jax.tree.map(np.asarray, want)
+    turn, shift = want.target_from_source.rotation, want.target_from_source.translation
+    moved = problem()[0] @ turn.T + shift
+    expected = np.sqrt(np.mean(np.sum(np.square(moved - want.partners), axis=1)))
+    np.testing.assert_allclose(result.rmse, expected, rtol=1e-3)  # f32 eps x condition
+    assert result.overlap == 1
+    assert result.converged
+
+
+@pytest.mark.parametrize("case", ["no source", "no target", "nothing", "not finite"])
+def test_without_an_answer_the_pose_is_the_initial_one(case):
+    xyz, target_xyz = single(problem())
+    source, target = cloud(xyz, N), cloud(target_xyz)
+    if case in ("no source", "nothing"):
+        source = source.replace(mask=np.zeros(N, bool))
+    if case in ("no target", "nothing"):
+        target = target.replace(mask=np.zeros(M, bool))
+    if case == "not finite":
+        source = source.replace(xyz=np.full_like(xyz, np.nan))
+    init = jax.tree.map(lambda leaf: leaf[0], starts(1))
+    result = jitted()(source, target, init, jax.random.key(0))
+    assert not result.converged
+    assert result.overlap == (case == "not finite")
+    assert np.isfinite(result.rmse)
+    np.testing.assert_array_equal(result.target_from_source.rotation, init.rotation)
+    np.testing.assert_array_equal(result.target_from_source.translation, init.translation)
+
+
+@functools.cache
+def pose_gradient():
+    """Gradients of a pose for the weights and both padded clouds, and the pose."""
+    xyz, target_xyz = single(problem())
+    source, target = cloud(xyz, N + 9), cloud(target_xyz, M + 11)
+
+    @jit
+    def gradient(source_xyz):
+        def total(variables, source_xyz, target_xyz):
+            moved, fixed = source.replace(xyz=source_xyz), target.replace(xyz=target_xyz)
+            (match,) = MODEL.apply(variables, moved, fixed, RigidTransform.identity(), 1)
+            pose = match.target_from_source
+            return jnp.sum(pose.as_matrix() ** 3), pose
+
+        slopes = jax.grad(total, (0, 1, 2), has_aux=True)
+        return slopes(single(exact_variables()), source_xyz, target.xyz)
+
+    return gradient, source, target
+
+
+def test_gradients_reach_every_weight_and_point_but_no_padding():
+    gradient, source, target = pose_gradient()
+    (to_variables, *to_clouds), _ = gradient(source.xyz)
+    # a constant added to every key changes no softmax
+    weights = jax.tree.leaves_with_path(to_variables)
+    assert all(np.abs(leaf).max() > 0 for path, leaf in weights if "key" not in str(path))
+    for found, mask in zip(to_clouds, (source.mask, target.mask), strict=True):
+        np.testing.assert_array_equal(found[~mask], 0)
+        assert np.abs(found[mask]).max(axis=1).min() > 0
+
+
+@pytest.mark.parametrize("axes", [(1, 1, 0), (1, 0, 0), (0, 0, 0)])
+def test_gradients_and_pose_stay_finite_on_a_plane_a_line_and_a_point(axes):
+    gradient, source, _ = pose_gradient()
+    slopes, pose = gradient(source.xyz * np.float32(axes))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+    rotation = pose.rotation
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=2e-6)  # f32 eps x 20

@@ -1,0 +1,400 @@
+"""PointNetLK: the published code's numbers, a slow float64 twin, padding, and the contract."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy.spatial.transform import Rotation
+
+from vanejax.errors import InputError
+from vanejax.matching.baselines.pointnet import WIDTHS, registration_from_pose
+from vanejax.matching.baselines.pointnetlk import PointNetLK, pointnetlk, variables_from_torch
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+
+PARITY = Path(__file__).parents[4] / "shared" / "parity"
+N, M, ROWS = 40, 50, 60  # every cloud has as many rows: each function is compiled once
+DELTA = 0.01
+
+
+@functools.cache
+def state_dict() -> dict[str, np.ndarray]:
+    """Random weights under PyTorch's names and in its shapes; gains of both signs."""
+    rng = np.random.default_rng(0)
+    state = {"dt": np.full((1, 6), DELTA)}
+    for index, (fan_in, out) in enumerate(itertools.pairwise(WIDTHS), start=1):
+        convolution, norm = (f"feature_model.{kind}{index}" for kind in ("conv", "bn"))
+        state[f"{convolution}.weight"] = rng.normal(size=(out, fan_in, 1)) * np.sqrt(2 / fan_in)
+        state[f"{convolution}.bias"] = rng.normal(size=out, scale=0.1)
+        gain = 1 + 0.2 * rng.normal(size=out)
+        state[f"{norm}.weight"] = gain * np.where(rng.uniform(size=out) < 0.2, -1, 1)
+        state[f"{norm}.bias"] = rng.normal(size=out, scale=0.1)
+        state[f"{norm}.running_mean"] = rng.normal(size=out, scale=0.1)
+        state[f"{norm}.running_var"] = rng.uniform(0.5, 1.5, size=out)
+        state[f"{norm}.num_batches_tracked"] = np.array(7)
+    return state
+
+
+@functools.cache
+def variables() -> dict:
+    return variables_from_torch(state_dict())
+
+
+@functools.cache
+def problem() -> tuple[np.ndarray, np.ndarray]:
+    """Two samples of one lopsided shape, the first moved: [N, 3] and [M, 3], f32."""
+    rng = np.random.default_rng(0)
+    xyz = rng.normal(size=(N + M, 3))
+    xyz *= [0.9, 0.6, 0.35] / np.linalg.norm(xyz, axis=-1, keepdims=True)
+    xyz *= 1 + 0.25 * np.sin(4 * xyz[:, :1] + 1)
+    turn = Rotation.from_rotvec([0.1, -0.15, 0.1]).as_matrix()
+    return np.float32(xyz[:N] @ turn.T + [0.1, 0, -0.1]), np.float32(xyz[N:])
+
+
+def cloud(xyz: np.ndarray, rows: int = ROWS) -> PointCloud:
+    """A cloud whose padding lies far away, scattered among the real points."""
+    place = np.sort(np.random.default_rng(rows).permutation(rows)[: len(xyz)])
+    padded = np.full((rows, 3), 30.0, np.float32)
+    padded[place] = xyz
+    mask = np.isin(np.arange(rows), place)
+    return PointCloud(xyz=jnp.asarray(padded), normals=jnp.asarray(padded), mask=jnp.asarray(mask))
+
+
+def pose(seed: int, size: float = 1.0) -> RigidTransform:
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_rotvec(size * rng.normal(size=3)).as_matrix()
+    return RigidTransform(np.float32(turn), np.float32(rng.normal(size=3, scale=0.3)))
+
+
+@functools.partial(jax.jit, static_argnames=("model", "iterations"))
+def run(model, weights, source, target, init, iterations=4):
+    return model.apply(weights, source, target, init, iterations)
+
+
+MODEL = PointNetLK()
+KEY = jax.random.key(0)
+START = jax.tree.map(jnp.asarray, RigidTransform.identity())
+register = jax.jit(pointnetlk(MODEL, variables(), iterations=4))
+judge = jax.jit(functools.partial(registration_from_pose, iterations=4, partner_distance=0.1))
+
+
+# ---- the slow twin: numpy float64, from the paper and the PyTorch layers it names ----
+
+
+def slow_feature(xyz: np.ndarray) -> np.ndarray:
+    """Convolution, batch norm in evaluation and ReLU, five times; then the maximum."""
+    x, state = np.asarray(xyz, np.float64), state_dict()
+    for index in range(1, 6):
+        convolution, norm = (f"feature_model.{kind}{index}" for kind in ("conv", "bn"))
+        x = x @ state[f"{convolution}.weight"][:, :, 0].T + state[f"{convolution}.bias"]
+        x = x - state[f"{norm}.running_mean"]
+        x = x / np.sqrt(state[f"{norm}.running_var"] + 1e-5)
+        x = np.maximum(x * state[f"{norm}.weight"] + state[f"{norm}.bias"], 0)
+    return x.max(axis=0)
+
+
+def slow_exp(twist: np.ndarray) -> np.ndarray:
+    (a, b, c), v = twist[:3], twist[3:]
+    return scipy.linalg.expm([[0, -c, b, v[0]], [c, 0, -a, v[1]], [-b, a, 0, v[2]], [0, 0, 0, 0]])
+
+
+def slow_move(matrix: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+    return xyz @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def slow_shift(offset: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = offset
+    return matrix
+
+
+def slow_pointnetlk(
+    source: np.ndarray, target: np.ndarray, iterations: int, origin: str
+) -> list[np.ndarray]:
+    """Total motions [4, 4] after each iteration."""
+    source, target = np.float64(source), np.float64(target)
+    target_mean = target.mean(axis=0)
+    source_mean = source.mean(axis=0) if origin == "means" else target_mean
+    template, source = target - target_mean, source - source_mean
+    feature = slow_feature(template)
+    jacobian = np.stack(
+        [
+            (feature - slow_feature(slow_move(slow_exp(-DELTA * axis), template))) / DELTA
+            for axis in np.eye(6)
+        ],
+        axis=1,
+    )
+    inverse, total, totals = np.linalg.pinv(jacobian), np.eye(4), []
+    for _ in range(iterations):
+        step = -inverse @ (slow_feature(slow_move(total, source)) - feature)
+        total = slow_exp(step) @ total
+        totals.append(slow_shift(target_mean) @ total @ slow_shift(-source_mean))
+    return totals
+
+
+@pytest.mark.parametrize("origin", ["means", "target"])
+def test_it_is_the_slow_twin_whatever_the_padding(origin):
+    source, target = problem()
+    model = PointNetLK(origin=origin)
+    found = run(model, variables(), cloud(source), cloud(target), START)
+    expected = slow_pointnetlk(source, target, 4, origin)
+    # f32 eps x the condition of the differences, 1 / delta, and of the pseudo-inverse
+    np.testing.assert_allclose(found.target_from_source.as_matrix(), expected, atol=2e-4)
+    # the problem is one in which something happens, and not all of it in the first step
+    assert np.abs(expected[0] - np.eye(4)).max() > 0.05
+    assert np.abs(expected[3] - expected[0]).max() > 0.01
+
+
+def test_the_residual_is_what_the_steps_came_from():
+    source, target = problem()
+    found = run(MODEL, variables(), cloud(source), cloud(target), START)
+    centered = source - source.mean(axis=0), target - target.mean(axis=0)
+    expected = slow_feature(centered[0]) - slow_feature(centered[1])
+    np.testing.assert_allclose(found.residual[0], expected, atol=2e-5)  # f32 eps x 100
+    template = jax.jit(functools.partial(MODEL.apply, method="template"))(
+        variables(), cloud(target)
+    )
+    steps = -found.residual @ template.twist_from_feature.T
+    np.testing.assert_allclose(found.twist, steps, atol=1e-5)
+
+
+# ---- laws ----
+
+
+def test_a_rigid_copy_about_the_template_is_found():
+    """The same points, turned a little: Lucas-Kanade holds its own with any weights."""
+    _, target = problem()
+    truth = pose(1, 0.03)
+    result = register(cloud(truth.inverse().apply(target)), cloud(target), START, KEY)
+    np.testing.assert_allclose(
+        result.target_from_source.as_matrix(), truth.as_matrix(), atol=1e-3
+    )  # the basin's bottom is exact; the differences' step is 0.01
+    assert result.converged
+    assert result.rmse < 1e-3
+    assert result.overlap == 1
+
+
+def test_points_in_another_order_change_nothing():
+    source, target = problem()
+    rng = np.random.default_rng(0)
+    plain = register(cloud(source), cloud(target), START, KEY)
+    mixed = register(cloud(rng.permutation(source)), cloud(rng.permutation(target)), START, KEY)
+    assert_same(mixed, plain, 1e-4)  # sums in another order, f32 eps x 1 / delta x condition
+
+
+def assert_same(found, expected, atol: float) -> None:
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, atol=atol)
+
+
+@pytest.mark.parametrize("origin", ["means", "target"])
+def test_an_initial_guess_is_a_source_that_was_moved_before(origin):
+    source, target = problem()
+    init = pose(2, 0.1)
+    model = PointNetLK(origin=origin)
+    found = run(model, variables(), cloud(source), cloud(target), init)
+    moved = run(model, variables(), cloud(init.apply(source)), cloud(target), START)
+    expected = moved.target_from_source.as_matrix() @ init.as_matrix()
+    np.testing.assert_allclose(found.target_from_source.as_matrix(), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("origin", ["means", "target"])
+def test_shifting_both_clouds_conjugates_the_answer(origin):
+    source, target = problem()
+    offset = np.float32([0.5, -0.25, 1.0])
+    model = PointNetLK(origin=origin)
+    plain = run(model, variables(), cloud(source), cloud(target), START)
+    shifted = run(model, variables(), cloud(source + offset), cloud(target + offset), START)
+    expected = slow_shift(offset) @ plain.target_from_source.as_matrix() @ slow_shift(-offset)
+    np.testing.assert_allclose(shifted.target_from_source.as_matrix(), expected, atol=2e-4)
+
+
+def test_only_with_the_targets_origin_does_the_sources_place_matter():
+    source, target = problem()
+    for origin, alike in (("means", True), ("target", False)):
+        model = PointNetLK(origin=origin)
+        near, far = (
+            run(model, variables(), cloud(source + np.float32(x)), cloud(target), START)
+            for x in (0.0, 0.2)
+        )
+        gap = np.abs(near.residual[0] - far.residual[0]).max()
+        assert (gap < 1e-4) == alike
+
+
+# ---- the contract ----
+
+
+def test_register_under_vmap_is_the_loop():
+    source, target = problem()
+    sources = [cloud(source[:size]) for size in (N, N - 7, 12)]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *sources)
+    inits = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[pose(k, 0.1) for k in range(3)])
+    keys = jax.random.split(KEY, 3)
+    batched = jax.jit(jax.vmap(register, in_axes=(0, None, 0, 0)))(
+        batch, cloud(target), inits, keys
+    )
+    for index in range(3):
+        init = jax.tree.map(lambda leaf, index=index: leaf[index], inits)
+        one = register(sources[index], cloud(target), init, keys[index])
+        assert one.converged.shape == one.rmse.shape == one.overlap.shape == ()
+        assert one.iterations == 4
+        assert_same(jax.tree.map(lambda leaf, index=index: leaf[index], batched), one, 1e-3)
+
+
+def test_registration_says_what_it_rests_on():
+    source, target = problem()
+    result = register(cloud(source), cloud(target), START, KEY)
+    moved = slow_move(np.asarray(result.target_from_source.as_matrix()), source)
+    nearest = np.linalg.norm(moved[:, None] - target[None], axis=-1).min(axis=1)
+    near = nearest <= 0.1
+    assert 0 < near.sum() < N
+    np.testing.assert_allclose(result.overlap, near.mean(), atol=1e-6)
+    np.testing.assert_allclose(result.rmse, np.sqrt(np.mean(nearest[near] ** 2)), atol=1e-6)
+
+
+def test_a_step_that_is_still_long_has_not_converged():
+    """After one step from 3 deg; after four it has, see the rigid copy above."""
+    _, target = problem()
+    eager = jax.jit(pointnetlk(MODEL, variables(), iterations=1))
+    source = pose(1, 0.03).inverse().apply(target)
+    assert not eager(cloud(source), cloud(target), START, KEY).converged
+
+
+@pytest.mark.parametrize("case", ["settled", "moving", "not finite", "nowhere near"])
+def test_it_converges_where_it_settles_on_a_finite_pose_near_the_target(case):
+    _, target = problem()
+    found, init = pose(1, 0.0), pose(2)
+    if case == "not finite":
+        found = found.replace(translation=np.full(3, np.nan, np.float32))
+    if case == "nowhere near":
+        found = found.replace(translation=np.full(3, 9, np.float32))
+    result = judge(
+        cloud(pose(1, 0.0).inverse().apply(target)),
+        cloud(target),
+        found,
+        init,
+        settled=jnp.asarray(case != "moving"),
+    )
+    assert result.converged == (case == "settled")
+    assert_same(result.target_from_source, init if case == "not finite" else found, 0)
+    assert np.isfinite(result.rmse)
+    assert case == "not finite" or result.overlap == (case != "nowhere near")
+
+
+@pytest.mark.parametrize(
+    "case", ["no source", "no target", "nothing", "one point", "coincident", "plane", "line"]
+)
+def test_degenerate_clouds_give_an_answer_without_nan(case):
+    source, target = (cloud(points) for points in problem())
+    if case in ("no source", "nothing"):
+        source = source.replace(mask=jnp.zeros(ROWS, bool))
+    if case in ("no target", "nothing"):
+        target = target.replace(mask=jnp.zeros(ROWS, bool))
+    if case == "one point":
+        source = source.replace(mask=jnp.cumsum(source.mask) == 3)
+    if case in ("coincident", "plane", "line"):
+        axes = {"coincident": (0, 0, 0), "plane": (1, 1, 0), "line": (1, 0, 0)}[case]
+        source, target = (c.replace(xyz=c.xyz * jnp.float32([axes])) for c in (source, target))
+    init = pose(3)
+    result = register(source, target, init, KEY)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(result))
+    rotation = result.target_from_source.rotation
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=5e-6)  # f32 eps x 50
+    if case.startswith("no"):
+        assert not result.converged
+        assert_same(result.target_from_source, init, 0)
+
+
+def test_gradients_reach_every_layer_and_no_padding():
+    source, target = problem()
+    clouds = cloud(source), cloud(target)
+
+    @jax.jit
+    def gradient(weights, *clouds):
+        def total(weights, *places):
+            moved = (c.replace(xyz=xyz) for c, xyz in zip(clouds, places, strict=True))
+            steps = MODEL.apply(weights, *moved, START, 2)
+            return jnp.sum(steps.target_from_source.as_matrix() ** 3)
+
+        return jax.grad(total, (0, 1, 2))(weights, *(c.xyz for c in clouds))
+
+    to_weights, *to_clouds = gradient(variables(), *clouds)
+    assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(to_weights))
+    for found, given in zip(to_clouds, clouds, strict=True):
+        np.testing.assert_array_equal(found[~given.mask], 0)
+        assert np.abs(found[given.mask]).max() > 0
+    for axes in ((1, 1, 0), (0, 0, 0)):
+        flat = (c.replace(xyz=c.xyz * jnp.float32([axes])) for c in clouds)
+        found = gradient(variables(), *flat)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+
+
+# ---- import, and parity with the published code ----
+
+
+def test_imported_weights_are_those_of_the_model():
+    points = cloud(problem()[0])
+    made = jax.eval_shape(lambda: MODEL.init(KEY, points, points, START, 1))
+    assert jax.tree.structure(variables()) == jax.tree.structure(made)
+    assert jax.tree.map(np.shape, variables()) == jax.tree.map(lambda leaf: leaf.shape, made)
+    assert {leaf.dtype for leaf in jax.tree.leaves(variables())} == {np.dtype(np.float32)}
+
+
+BIAS = "feature_model.conv3.bias"
+KERNEL = "feature_model.conv4.weight"
+VARIANCE = "feature_model.bn2.running_var"
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({BIAS: None}, BIAS),
+        ({VARIANCE: None}, VARIANCE),
+        ({"classifier.weight": np.zeros(3)}, "classifier.weight"),
+        ({KERNEL: np.zeros((64, 128, 1))}, KERNEL),  # transposed
+        ({KERNEL: np.zeros((128, 64, 3))}, KERNEL),
+        ({KERNEL: np.zeros(128)}, KERNEL),
+        ({BIAS: np.zeros(63)}, BIAS),
+        ({BIAS: np.full(64, np.nan)}, BIAS),
+        ({VARIANCE: np.full(64, -1.0)}, VARIANCE),
+        ({"dt": None}, "dt"),
+        ({"dt": np.full((1, 6), 0.02)}, "dt"),
+    ],
+)
+def test_import_refuses_another_model_and_names_what_differs(changes, words):
+    state = {name: value for name, value in (state_dict() | changes).items() if value is not None}
+    with pytest.raises(InputError, match=words.replace(".", r"\.")):
+        variables_from_torch(state)
+
+
+def test_import_does_not_need_the_count_of_batches():
+    state = {name: value for name, value in state_dict().items() if "num_batches" not in name}
+    jax.tree.map(np.testing.assert_array_equal, variables_from_torch(state), variables())
+
+
+@pytest.mark.skipif(
+    not (PARITY / "pointnetlk.npz").exists(), reason="needs ../shared/parity/pointnetlk.npz"
+)
+def test_parity_with_the_published_weights():
+    with np.load(PARITY / "pointnetlk.npz") as file:
+        io = dict(file)
+    weights = variables_from_torch(
+        {name[2:]: value for name, value in io.items() if name.startswith("w:")}
+    )
+    describe = jax.jit(functools.partial(MODEL.apply, method="template"))
+    for pair in range(3):
+        source, target = (cloud(io[name][pair], 1024) for name in ("source", "template"))
+        feature = describe(weights, target).feature
+        # f32 eps x 100 on features up to 6
+        np.testing.assert_allclose(feature, io["template_feature"][pair], atol=1e-4)
+        found = run(MODEL, weights, source, target, START, 10).target_from_source.as_matrix()
+        for count in (1, 2, 10):
+            expected = io[f"est_T_{count}"][pair]
+            np.testing.assert_allclose(found[count - 1], expected, atol=1e-4)  # measured: 6e-6

@@ -1,0 +1,157 @@
+"""The transformer against the published formulas in float64 loops, and padding."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.special
+
+from vanejax.matching.baselines.transformer import LayerNorm, Transformer, attention
+
+N, M, WIDTH, HEADS, HIDDEN = 7, 9, 16, 4, 24
+EXACT = 1e-11  # f64 eps x three sublayers' condition of about 1e4
+MODEL = Transformer(width=WIDTH, heads=HEADS, hidden=HIDDEN)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _double_precision():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def clouds() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(1)
+    return rng.normal(size=(N, WIDTH)), rng.normal(size=(M, WIDTH))
+
+
+@pytest.fixture(scope="module")
+def params(clouds) -> dict:
+    x, y = clouds
+    rng = np.random.default_rng(0)
+    made = jax.eval_shape(MODEL.init, jax.random.key(0), x, np.ones(N, bool), y, np.ones(M, bool))
+    return jax.tree.map(lambda leaf: 0.4 * rng.normal(size=leaf.shape), made)["params"]
+
+
+run = jax.jit(lambda params, *args: MODEL.apply({"params": params}, *args))
+
+
+def slow_attention(q, k, v) -> np.ndarray:
+    """One head, one query at a time."""
+    rows = []
+    for query in q:
+        weights = scipy.special.softmax([query @ key / np.sqrt(len(query)) for key in k])
+        rows.append(sum(weight * value for weight, value in zip(weights, v, strict=True)))
+    return np.array(rows)
+
+
+def slow_norm(x, p) -> np.ndarray:
+    spread = x.std(axis=-1, keepdims=True, ddof=1) + 1e-6
+    return p["scale"] * (x - x.mean(axis=-1, keepdims=True)) / spread + p["bias"]
+
+
+def dense(x, p) -> np.ndarray:
+    return x @ p["kernel"] + p["bias"]
+
+
+def slow_heads(x, memory, p) -> np.ndarray:
+    q, k, v = dense(x, p["query"]), dense(memory, p["key"]), dense(memory, p["value"])
+    parts = [slow_attention(q[:, h], k[:, h], v[:, h]) for h in np.split(np.arange(WIDTH), HEADS)]
+    return dense(np.concatenate(parts, axis=1), p["out"])
+
+
+def slow_feed_forward(x, p) -> np.ndarray:
+    return dense(np.maximum(dense(x, p["in"]), 0), p["out"])
+
+
+def slow_transformer(x, y, p) -> np.ndarray:
+    """decoder(x, encoder(y)), in the order of the published code."""
+    norms = [p[f"encoder_norms_{i}"] for i in range(3)]
+    inner = slow_norm(y, norms[0])
+    y = y + slow_heads(inner, inner, p["encoder_attention"])
+    y = y + slow_feed_forward(slow_norm(y, norms[1]), p["encoder_feed_forward"])
+    memory = slow_norm(y, norms[2])
+    norms = [p[f"decoder_norms_{i}"] for i in range(4)]
+    inner = slow_norm(x, norms[0])
+    x = x + slow_heads(inner, inner, p["decoder_attention"])
+    x = x + slow_heads(slow_norm(x, norms[1]), memory, p["cross_attention"])
+    x = x + slow_feed_forward(slow_norm(x, norms[2]), p["decoder_feed_forward"])
+    return slow_norm(x, norms[3])
+
+
+def padded(x: np.ndarray, rows: int, junk: float) -> tuple[np.ndarray, np.ndarray]:
+    """Padding lies scattered among the real rows."""
+    place = np.sort(np.random.default_rng(2).permutation(rows)[: len(x)])
+    full = np.full((rows, x.shape[1]), junk)
+    full[place] = x
+    return full, np.isin(np.arange(rows), place)
+
+
+def test_attention_is_the_slow_twin():
+    rng = np.random.default_rng(3)
+    q, k, v = (rng.normal(size=(rows, HEADS, 5)) for rows in (N, M, M))
+    mask = np.arange(M) != 4
+    found = attention(q, k, v, mask)
+    for head in range(HEADS):
+        expected = slow_attention(q[:, head], k[mask, head], v[mask, head])
+        np.testing.assert_allclose(found[:, head], expected, atol=1e-13)  # f64 eps x 100
+
+
+def test_attention_to_large_scores_and_to_nothing_is_finite():
+    q = np.full((N, HEADS, 5), 1e3)
+    k = np.random.default_rng(4).normal(size=(M, HEADS, 5)) * 1e3
+    none = np.zeros(M, bool)
+    for mask in (~none, none):
+        found, slope = jax.value_and_grad(lambda k, mask=mask: jnp.sum(attention(q, k, k, mask)))(
+            jnp.asarray(k)
+        )
+        assert np.isfinite(found)
+        assert np.isfinite(slope).all()
+
+
+def test_layer_norm_of_a_row_without_spread_is_its_bias():
+    p = {"scale": np.arange(4.0), "bias": np.arange(4.0) + 1}
+
+    def total(x):
+        return jnp.sum(LayerNorm().apply({"params": p}, x) ** 2)
+
+    x = np.full((2, 4), 3.0)
+    np.testing.assert_array_equal(LayerNorm().apply({"params": p}, x), [p["bias"]] * 2)
+    assert np.isfinite(jax.grad(total)(x)).all()
+
+
+def test_it_is_the_slow_twin(params, clouds):
+    x, y = clouds
+    found = run(params, x, np.ones(N, bool), y, np.ones(M, bool))
+    np.testing.assert_allclose(found, slow_transformer(x, y, params), atol=EXACT)
+
+
+@pytest.mark.parametrize("junk", [0.0, 1e3])
+def test_padding_of_either_cloud_changes_nothing(params, clouds, junk):
+    (x, x_mask), (y, y_mask) = (padded(cloud, len(cloud) + 5, junk) for cloud in clouds)
+    found = run(params, x, x_mask, y, y_mask)
+    np.testing.assert_allclose(found[x_mask], slow_transformer(*clouds, params), atol=EXACT)
+    assert np.isfinite(found).all()
+
+
+def test_no_gradient_reaches_padding(params, clouds):
+    (x, x_mask), (y, y_mask) = (padded(cloud, len(cloud) + 5, 0.3) for cloud in clouds)
+
+    def total(x, y):
+        return jnp.sum(jnp.where(x_mask[:, None], run(params, x, x_mask, y, y_mask), 0) ** 3)
+
+    for found, mask in zip(jax.grad(total, (0, 1))(x, y), (x_mask, y_mask), strict=True):
+        np.testing.assert_array_equal(found[~mask], 0)
+        assert np.abs(found[mask]).max(axis=1).min() > 0
+
+
+def test_order_of_either_cloud(params, clouds):
+    """Its own order is kept; that of the cloud that it looks at does not matter."""
+    x, y = clouds
+    rng = np.random.default_rng(5)
+    rows, columns = rng.permutation(N), rng.permutation(M)
+    plain = run(params, x, np.ones(N, bool), y, np.ones(M, bool))
+    mixed = run(params, x[rows], np.ones(N, bool), y[columns], np.ones(M, bool))
+    np.testing.assert_allclose(mixed, plain[rows], atol=EXACT)

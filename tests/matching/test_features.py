@@ -1,0 +1,102 @@
+"""Point-pair features: exact at the point itself, unchanged by rigid motions, smooth."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from scipy.spatial.transform import Rotation
+
+from vanejax.matching.features import angle_between, point_pair_features
+
+angle_between = jax.jit(angle_between)
+point_pair_features = jax.jit(point_pair_features)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def neighborhoods(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Offsets [N, K, 3], normals [N, 3] and neighbours' normals [N, K, 3]; f64."""
+    rng = np.random.default_rng(seed)
+    offset = rng.normal(size=(9, 4, 3), scale=0.2)
+    return offset, unit(rng.normal(size=(9, 3))), unit(rng.normal(size=(9, 4, 3)))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 1e-3, 0.7, np.pi / 2, 3.0, np.pi - 1e-3, np.pi])
+def test_angle_between_is_accurate_over_the_whole_range(angle):
+    rng = np.random.default_rng(0)
+    for scale in (1e-3, 1.0, 1e3):
+        frame = Rotation.random(rng=rng).as_matrix()
+        a = 0.5 * frame[0]
+        b = scale * (np.cos(angle) * frame[0] + np.sin(angle) * frame[1])
+        a32, b32 = a.astype(np.float32), b.astype(np.float32)
+        # rounding the vectors turns them by f32 eps; that is the input's, not the function's
+        sine = np.linalg.norm(np.cross(a32.astype(float), b32.astype(float)))
+        exact = np.arctan2(sine, np.dot(a32.astype(float), b32.astype(float)))
+        np.testing.assert_allclose(exact, angle, atol=2e-7)
+        np.testing.assert_allclose(angle_between(a32, b32), exact, atol=4e-7)  # f32 eps of pi
+
+
+def test_angle_with_a_zero_vector_is_zero():
+    for zero in (0.0, -0.0):
+        for other in ([0.0, 0, 1], [-1.0, 0, 0], [-0.6, -0.8, -0.0], [0.0, -0.0, 0.0]):
+            a, b = jnp.full(3, zero, jnp.float32), jnp.array(other, jnp.float32)
+            assert angle_between(a, b) == 0
+            assert angle_between(b, a) == 0
+
+
+def test_the_point_itself_has_exactly_zero_features():
+    """Padding of the neighbourhood with itself; an epsilon in a root would give 90 degrees."""
+    _, normals, _ = neighborhoods()
+    normals = np.concatenate([normals, -np.eye(3), [[-0.0, 0.0, -1.0]]]).astype(np.float32)
+    for zero in (0.0, -0.0):
+        offset = np.full((len(normals), 2, 3), zero, np.float32)
+        own = np.repeat(normals[:, None], 2, axis=1)
+        found = np.array(point_pair_features(offset, normals, own))
+        found[..., 2][np.abs(found[..., 2]) < 2e-7] = 0  # n x n by fused multiply-add: f32 eps
+        np.testing.assert_array_equal(found, 0)
+
+
+def test_features_are_drost_s():
+    offset, normal, other = neighborhoods()
+    found = point_pair_features(*(x.astype(np.float32) for x in (offset, normal, other)))
+    assert found.shape == (9, 4, 4)
+    for i in range(9):
+        for k in range(4):
+            d = unit(offset[i, k])
+            expected = [
+                np.arccos(normal[i] @ d),
+                np.arccos(other[i, k] @ d),
+                np.arccos(normal[i] @ other[i, k]),
+                np.linalg.norm(offset[i, k]),
+            ]
+            np.testing.assert_allclose(found[i, k], expected, atol=2e-6)  # f32 eps x 10
+
+
+def test_rigid_motions_change_nothing_and_reflections_of_normals_do():
+    offset, normal, other = neighborhoods()
+    turn = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix().T
+    with jax.enable_x64(True):
+        before = point_pair_features(offset, normal, other)
+        after = point_pair_features(offset @ turn, normal @ turn, other @ turn)
+        np.testing.assert_allclose(after, before, atol=1e-13)  # f64 eps x 100
+        flipped = point_pair_features(offset, -normal, other)
+        np.testing.assert_allclose(flipped[..., 0], np.pi - before[..., 0], atol=1e-13)
+        np.testing.assert_allclose(flipped[..., 2], np.pi - before[..., 2], atol=1e-13)
+
+
+def test_gradients_are_right_and_finite_where_there_is_no_angle():
+    inputs = neighborhoods()
+    with jax.enable_x64(True):
+        check_grads(point_pair_features, inputs, order=1, modes=["fwd", "rev"], eps=1e-5)
+    up = np.array([0, 0, 1], np.float32)
+    gradient = jax.jit(jax.grad(lambda *args: jnp.sum(point_pair_features(*args)), (0, 1, 2)))
+    # the point itself, a neighbour along the normal, one against it, and normals of no length
+    for offset in (0 * up, up, -up):
+        for normal in (up, -up, 0 * up):
+            for found in gradient(offset[None, None], up[None], normal[None, None]):
+                assert np.isfinite(found).all()

@@ -1,0 +1,433 @@
+"""The pages: every command is one that its program takes, every link leads somewhere.
+
+What is cheap is run as written (the quick start, all Python of the new pages); of what takes long,
+the program and its own parser are asked. `test_readme` and `test_compensate` run their own pages.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import json
+import re
+import runpy
+import shlex
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import FunctionType
+
+import pytest
+import test_contract
+import test_verdict
+from absl import flags
+
+from experiments.pages.reproduction.studies import STUDIES
+from experiments.runner import command_line
+from experiments.runner.experiment import Experiment
+from experiments.studies.comparison.settings import METHODS
+from vanejax.cli.program import main, make_parser
+from vanejax.cli.register import EXIT_CODES
+from vanejax.errors import InputError
+from vanejax.localization import clutter_removal as foreign_points
+from vanejax.localization.verdict import Rival
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CHANGELOG.md"])
+NEW = ("quick_start", "how_it_works", "conventions", "adding_a_method")
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+TOOLS = ("cat", "cut", "head", "tail", "ls", "cd", "mkdir")
+FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
+
+
+def blocks(text: str, *languages: str) -> list[tuple[str, str]]:
+    """(language, content) of the fenced blocks in these languages, in order."""
+    return [(found[2], found[3]) for found in FENCED.finditer(text) if found[2] in languages]
+
+
+def commands(text: str) -> Iterator[list[str]]:
+    """The simple commands of shell text: comments off, lines joined, split at && and ;."""
+    text = re.sub(
+        r"<<'?(\w+)'?\n.*?\n\1$", "", text, flags=re.DOTALL | re.MULTILINE
+    )  # here-documents
+    text = re.sub(r" >>? *\S+", "", text)  # where the output goes
+    for line in text.replace("\\\n", " ").splitlines():
+        lexer = shlex.shlex(line, posix=True, punctuation_chars="&;|")
+        lexer.whitespace_split = True
+        words: list[str] = []
+        for word in lexer:
+            if set(word) <= set("&;|"):
+                yield words
+                words = []
+            else:
+                words.append(word)
+        if words:
+            yield words
+
+
+def inline_commands(text: str) -> Iterator[list[str]]:
+    """Commands with arguments that stand between backticks in a sentence."""
+    for code in re.findall(r"`((?:vanejax|python -m) [^`]+)`", FENCED.sub("", text)):
+        words = shlex.split(code)
+        if len(words) > 2:
+            yield words
+
+
+def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Asks the program of a command whether it takes these arguments.
+
+    Raises:
+      AssertionError: it does not, or the program is none that is known here.
+    """
+    while re.fullmatch(r"\w+=.*", words[0]):
+        words = words[1:]
+    program, rest = words[0].rpartition("/")[2], words[1:]
+    try:
+        if program == "vanejax":
+            make_parser().parse_args(rest)
+        elif program in ("python", "python3") and rest[:1] == ["-m"]:
+            check_module(rest[1], rest[2:], monkeypatch)
+        elif program == "pip":
+            check_pip(rest)
+        elif program == ".":
+            assert rest == [".venv/bin/activate"]
+        elif program == "jupyter":
+            assert rest[0] in ("lab", "notebook")
+            assert (ROOT / rest[1]).exists()
+        else:
+            assert program in TOOLS, "no program that this test knows"
+    except (AssertionError, InputError, SystemExit) as error:
+        raise AssertionError(f"{shlex.join(words)}: {error}") from error
+
+
+def check_pip(rest: list[str]) -> None:
+    """Installs of this project, with extras that it has."""
+    names = [word for word in rest if not word.startswith("-") and word != "install"]
+    assert rest[0] == "install"
+    for name in names:
+        found = re.fullmatch(r"(?:\.|vanejax)(?:\[([\w,]+)\])?", name)
+        assert found, f"no package of this project: {name}"
+        assert set((found[1] or "").split(",")) - {""} <= set(EXTRAS), f"no such extra: {name}"
+
+
+def check_module(module: str, rest: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The module is there, and its command takes the arguments; nothing of it is run."""
+    if not module.startswith("experiments."):
+        assert module in ("venv", "pytest"), f"no module that this test knows: {module}"
+        return
+    path = ROOT / Path(*module.split(".")).with_suffix(".py")
+    assert path.exists(), f"no such module: {module}"
+    source = path.read_text()
+    assert 'if __name__ == "__main__":' in source, f"{module} is no command"
+    if any(
+        isinstance(n, ast.FunctionDef) and n.name == "make_parser" for n in ast.parse(source).body
+    ):
+        importlib.import_module(module).make_parser().parse_args(rest)
+    elif "command_line.run(" in source:
+        parse_flags(path, rest, monkeypatch)
+    else:
+        assert not rest, f"{module} takes no arguments"
+
+
+def parse_flags(path: Path, rest: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs a command of `experiments.runner.command_line` up to where the work would begin."""
+    before = set(flags.FLAGS)
+
+    def parse_only(run: FunctionType, *, tree: type = Experiment) -> None:
+        left = command_line._parse(tree, command_line.resolve_config(sys.argv))
+        assert left[1:] == [], f"no such argument: {left[1:]}"
+        config = flags.FLAGS.config
+        assert isinstance(config, tree), f"--config must hold a {tree.__name__}"
+        config.check()
+        assert set(getattr(flags.FLAGS, "methods", ())) <= set(METHODS)
+        space = run.__globals__
+        for name, value in list(space.items()):  # what the module itself would do
+            if (
+                isinstance(value, FunctionType)
+                and value.__module__ == "__main__"
+                and value is not run
+            ):
+                space[name] = lambda *_, **__: 0
+        run()
+
+    monkeypatch.setattr(sys, "argv", [path.stem, *rest])
+    monkeypatch.setattr(command_line, "run", parse_only)
+    try:
+        runpy.run_path(str(path), run_name="__main__")
+    finally:
+        for name in set(flags.FLAGS) - before:
+            delattr(flags.FLAGS, name)
+        flags.FLAGS.unparse_flags()
+        monkeypatch.undo()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """Where the configs and the example of a page lie."""
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs" / "adding_a_method.md").read_text()
+    (config,) = [code for _, code in blocks(text, "python") if "get_config" in code]
+    (tmp_path / "my_vane.py").write_text(config)
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_is_one_that_its_program_takes(page, folder) -> None:
+    text = page.read_text()
+    shell = "\n".join(code for _, code in blocks(text, "sh", "bash", "shell", "console"))
+    wrong = []
+    for words in [*commands(shell), *inline_commands(text)]:
+        with pytest.MonkeyPatch.context() as patch:
+            try:
+                check(words, patch)
+            except AssertionError as error:
+                wrong.append(str(error))
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "vanejax register scan.ply part.stl --unit mm",
+        "vanejax registers scan.ply part.stl",
+        "python -m experiments.trane --config vane.py",
+        "python -m experiments.train --config vain.py",
+        "python -m experiments.train --config vane.py --config.model.neighbors=16",
+        "python -m experiments.train --config vane.py --config.model.num_neighbors=few",
+        "python -m experiments.train --config table1.py",
+        "python -m experiments.train --config vane.py --config.data.noise=-1",
+        "python -m experiments.compare --config table1.py --methods icq",
+        "python -m experiments.ablate --config vane.py --sweep model.neighbors=8,16",
+        "python -m experiments.fine --vews 3",
+        "python -m experiments.results_page --fast",
+        "python -m experiments.studies.comparison.methods",
+        "pip install -e '.[peer]'",
+        "rm -rf runs",
+    ],
+)
+def test_a_wrong_command_is_found(line, folder, monkeypatch) -> None:
+    (words,) = commands(line)
+    with pytest.raises(AssertionError, match=re.escape(words[0])):
+        check(words, monkeypatch)
+
+
+def test_every_program_of_the_pages_is_run_by_reproduce_or_by_a_test() -> None:
+    """What takes hours is run by `experiments.reproduce`, the rest by tests."""
+    named = set()
+    for page in PAGES:
+        text = page.read_text()
+        shell = "\n".join(code for _, code in blocks(text, "sh", "bash", "shell", "console"))
+        for words in [*commands(shell), *inline_commands(text)]:
+            words = [word for word in words if not re.fullmatch(r"\w+=.*", word)]
+            if words[0].rpartition("/")[2] in ("python", "python3"):
+                named.add(words[2])
+    run_by_tests = {
+        f"experiments.{name}": ROOT / "tests" / f"test_{name}.py"
+        for name in ("docs_pictures", "evaluate", "performance_page", "reproduce", "results_page")
+    }
+    assert all(path.exists() for path in run_by_tests.values())
+    studied = {study.arguments[0] for study in STUDIES}
+    assert named - studied - set(run_by_tests) == {"venv", "pytest"}
+
+
+def test_shell_text_falls_into_its_commands() -> None:
+    text = "a -x '.[b]' && b 1 \\\n  2  # words\n\n. c > d.log\ncat > e <<'END'\nf g\nEND\nh | i\n"
+    found = [["a", "-x", ".[b]"], ["b", "1", "2"], [".", "c"], ["cat"], ["h"], ["i"]]
+    assert list(commands(text)) == found
+    assert list(inline_commands("`vanejax scan vane --out x`, `vanejax scan`, `vanejax`")) == [
+        ["vanejax", "scan", "vane", "--out", "x"]
+    ]
+
+
+def slugs(text: str) -> set[str]:
+    """The anchors that GitHub gives the headings of a page."""
+    found: dict[str, int] = {}
+    names = set()
+    for heading in re.findall(r"^#{1,6} +(.+?) *#*$", FENCED.sub("", text), re.MULTILINE):
+        plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).replace("`", "").lower()
+        name = re.sub(r"[^\w\- ]", "", plain).replace(" ", "-")
+        count = found.get(name, 0)
+        found[name] = count + 1
+        names.add(f"{name}-{count}" if count else name)
+    return names | set(re.findall(r'<a (?:id|name)="([^"]+)"', text))
+
+
+def links(text: str) -> list[str]:
+    """Targets of links and pictures outside code."""
+    prose = re.sub(r"`[^`\n]*`", "", FENCED.sub("", text))
+    return re.findall(r"\[[^\]]*\]\(([^)\s]+)\)", re.sub(r"!\[", "[", prose)) + re.findall(
+        r'(?:src|href)="([^"]+)"', prose
+    )
+
+
+def dead(page: Path, text: str) -> list[str]:
+    """Links of a page that lead nowhere."""
+    found = []
+    for link in links(text):
+        if re.match(r"https://|mailto:|data:", link):
+            continue
+        name, _, anchor = link.partition("#")
+        place = (page.parent / name).resolve() if name else page
+        if not place.is_relative_to(ROOT) or not place.exists():
+            found.append(link)
+        elif anchor:
+            there = text if place == page else place.read_text() if place.suffix == ".md" else ""
+            if anchor not in slugs(there):
+                found.append(link)
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_and_picture_is_there(page) -> None:
+    assert dead(page, page.read_text()) == []
+
+
+def test_a_dead_link_is_found() -> None:
+    text = "# A (b) `c`: d\n[x](#a-b-c-d) [y](#a-b) [z](none.md) ![p](none.png) [q](README.md#no)"
+    assert dead(ROOT / "README.md", text) == ["#a-b", "none.md", "none.png", "README.md#no"]
+
+
+def test_the_index_lists_every_page_and_pages_show_every_picture() -> None:
+    listed = links((ROOT / "docs" / "README.md").read_text())
+    shown = {Path(link).name for page in PAGES for link in links(page.read_text())}
+    files = sorted((ROOT / "docs").iterdir())
+    assert [p.name for p in files if p.suffix == ".md" and p.name not in listed] == ["README.md"]
+    assert [p.name for p in files if p.suffix in (".png", ".svg") and p.name not in shown] == []
+
+
+def test_the_modules_that_pages_name_are_there() -> None:
+    missing = []
+    for page in PAGES:
+        for name in re.findall(r"`((?:vanejax|experiments)(?:\.\w+)+)[`(]", page.read_text()):
+            parts = name.split(".")
+            for length in range(len(parts), 0, -1):
+                place = ROOT.joinpath(*parts[:length])
+                if place.is_dir() or place.with_suffix(".py").exists():
+                    break
+            found = importlib.import_module(".".join(parts[:length]))
+            for part in parts[length:]:
+                found = getattr(found, part, None) or getattr(found, "__annotations__", {}).get(
+                    part
+                )
+            if found is None:
+                missing.append(f"{page.name}: {name}")
+    assert missing == []
+
+
+# ---- what is run as it is written
+
+
+def masked(text: str) -> list[str]:
+    """Lines without their figures: another processor's last digits may differ."""
+    return [re.sub(r"\d[\d,.e]*", "#", line) for line in text.splitlines()]
+
+
+# tried only: the first takes half a minute until everything was tried, the others a trained network
+LONG = ("register scan.ply block.stl", "experiments.", "export", "--weights", "pip", "venv")
+
+
+def test_the_quick_start_runs_as_written(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("VANEJAX_CACHE_DIR", "off")
+    page = (ROOT / "docs" / "quick_start.md").read_text()
+    run, verdicts = 0, 0
+    printed = ""
+    for language, code in blocks(page, "python", "sh", "text"):
+        if language == "python":
+            exec(compile(code, "quick_start.md", "exec"), {})
+            continue
+        if language == "sh":
+            printed = ""
+            for words in commands(code):
+                if any(word in shlex.join(words) for word in LONG) or words[0] == ".":
+                    continue
+                exit_code = main(words[1:])
+                said = capsys.readouterr().out
+                if words[1] == "register":
+                    status = said.partition(":")[0].lower()
+                    assert exit_code == EXIT_CODES[status]
+                    verdicts += 1
+                printed += said + "\n"
+                run += 1
+            continue
+        here = set(masked(printed))
+        for line, kept in zip(code.splitlines(), masked(code), strict=True):
+            if line and not re.match(r"time:|\.\.\.|REJECTED", line):
+                assert kept in here, f"not printed: {line}"
+    assert (run, verdicts) == (9, 6)
+    assert Path("pose.html").stat().st_size > 10_000
+    assert json.loads(Path("pose.json").read_text())["verdict"]["status"] == "accepted"
+
+
+def reasons() -> dict[tuple[str, str], re.Pattern[str]]:
+    """Of the quick start's table: by verdict and words, what fits them; … is one word, ... any."""
+    page = (ROOT / "docs" / "quick_start.md").read_text()
+    rows = re.findall(r"^\| (accepted|ambiguous|rejected) \| `([^`]+)` \|", page, re.MULTILINE)
+    return {
+        row: re.compile(re.escape(row[1]).replace("…", r"\S+").replace(r"\.\.\.", ".*"))
+        for row in rows
+    }
+
+
+def test_every_reason_of_the_verdict_has_its_line() -> None:
+    """`register` can say nothing that the quick start does not explain, and the page no more."""
+    pose = test_verdict.FAR.part_from_camera
+    better, close = Rival(-20.0, 180.0, 0.5, pose), Rival(1.0, 180.0, 0.5, pose)
+    said = [
+        test_verdict.verdict(),
+        test_verdict.verdict(rivals=(close,)),
+        test_verdict.verdict(rivals=(better, close)),
+        test_verdict.verdict(inlier_share=0.65),
+        test_verdict.verdict(inlier_share=0.65, unmeasured_share=float("nan")),
+        test_verdict.verdict(tolerance_mm=3 * 0.03 * test_verdict.RADIUS),
+        test_verdict.verdict(uncertainty={"weakest_rotation_sigma_deg": 2.0}),
+        test_verdict.verdict(uncertainty={"weakest_translation_sigma_mm": 2.0}),
+        *(test_verdict.verdict(**changes) for changes in test_verdict.REJECTED.values()),
+    ]
+    used = set()
+    for verdict in said:
+        rows = [
+            row
+            for row, pattern in reasons().items()
+            if row[0] == verdict.status and pattern.fullmatch(verdict.reason)
+        ]
+        assert len(rows) == 1, f"{verdict.status}: {verdict.reason}"
+        used.add(rows[0])
+    (left,) = set(reasons()) - used  # the one that is not said of a pose alone
+    tree = ast.parse(Path(foreign_points.__file__).read_text())
+    templates = [
+        "".join(p.value if isinstance(p, ast.Constant) else "…%" for p in text.values)
+        for text in ast.walk(tree)
+        if isinstance(text, ast.JoinedStr)
+    ]
+    assert left[0] == "rejected"
+    assert left[1] in templates
+
+
+@pytest.mark.parametrize("name", NEW[2:])
+def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    space: dict[str, object] = {"__name__": name}
+    for _, code in blocks((ROOT / "docs" / f"{name}.md").read_text(), "python"):
+        exec(compile(code, f"{name}.md", "exec"), space)
+
+
+def test_the_method_of_the_page_keeps_the_contract(monkeypatch) -> None:
+    text = (ROOT / "docs" / "adding_a_method.md").read_text()
+    space: dict[str, object] = {}
+    exec(compile(blocks(text, "python")[0][1], "adding_a_method.md", "exec"), space)
+    with pytest.raises(InputError, match="max_distance"):
+        space["pca"](max_distance=0)
+    monkeypatch.setitem(test_contract.CASES, "PCA", test_contract.Case(space["pca"]))
+    for test in (
+        "perturbed",
+        "swapped",
+        "the_guess_is_part_of_the_answer",
+        "padding_is_irrelevant",
+    ):
+        seed = (0,) if test == "perturbed" else ()
+        getattr(test_contract, f"test_{test}")("PCA", *seed)
+    for what in ("no source", "no target", "nothing"):
+        test_contract.test_without_overlap_nothing_is_claimed("PCA", what)
+    test_contract.test_a_batch_is_its_pairs("PCA")

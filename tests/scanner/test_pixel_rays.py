@@ -1,0 +1,140 @@
+"""The rays of a view's pixels against the camera's own, and where they meet planes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vanejax.scanner.camera import Camera, look_at
+from vanejax.scanner.image_window import Window
+from vanejax.scanner.pixel_rays import PLANES_AT_ONCE, MeasuredPixels, PixelRays
+
+CAMERA = Camera(width=320, height=256, near_mm=100)
+POSE = look_at(400 * np.array([0.43301, 0.25, 0.86603]), np.array([3.0, -2.0, 1.0]))
+WINDOW = Window(slice(20, 50), slice(7, 107))
+
+
+def view(*, backs: bool = False) -> PixelRays:
+    return PixelRays.of(CAMERA, POSE, start_mm=320.0, farthest_mm=600.0, backs=backs)
+
+
+def planes_through(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    return np.column_stack([normals, np.sum(points * normals, axis=-1)])
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def test_rays_are_the_camera_s():
+    starts, directions = view().through(WINDOW)
+    assert starts.dtype == directions.dtype == np.float32
+    row, column = WINDOW.pixels(np.arange(WINDOW.size))
+    expected = POSE.inverse().rotate(CAMERA.ray_directions(column, row))
+    np.testing.assert_allclose(unit(directions.astype(np.float64)), expected, atol=2e-7)  # f32 x 3
+    at_camera = POSE.apply(starts.astype(np.float64))
+    # three roundings of some 200 mm: 2e-5 mm, or 1e-4 pixels
+    np.testing.assert_allclose(at_camera[:, 2], -320, atol=5e-5)
+    centres = np.column_stack([column, row]) + 0.5
+    np.testing.assert_allclose(CAMERA.project(at_camera), centres, atol=1e-4)
+
+
+def test_a_ray_s_bits_do_not_depend_on_its_window():
+    whole = view().through(Window(slice(0, 256), slice(0, 320)))
+    for part, all_of_it in zip(view().through(WINDOW), whole, strict=True):
+        np.testing.assert_array_equal(
+            part.reshape(30, 100, 3), all_of_it.reshape(256, 320, 3)[WINDOW]
+        )
+
+
+def test_depths_are_where_rays_meet_their_planes():
+    rng = np.random.default_rng(0)
+    column, row = rng.integers(0, 320, 500), rng.integers(0, 256, 500)
+    depth = rng.uniform(50, 1500, 500)
+    x, y = CAMERA.slopes(column, row)
+    at_camera = depth[:, None] * np.stack([x, y, np.full(500, -1.0)], axis=-1)
+    points = POSE.inverse().apply(at_camera)
+    rays = unit(points - POSE.inverse().translation)
+    normals = unit(rng.normal(size=(500, 3)))
+    cosine = -np.sum(normals * rays, axis=-1)
+    normals *= np.where(np.arange(500) < 400, np.sign(cosine), -np.sign(cosine))[:, None]
+    between = (depth >= 100) & (depth <= 1300)
+    assert 300 < between.sum() < 480
+    for backs in (False, True):
+        seen = view(backs=backs)
+        planes = seen.facing(planes_through(points, normals))
+        found, measured = seen.depth(x, y, planes)
+        np.testing.assert_allclose(found, depth, rtol=1e-9)  # f64 eps / the least cosine, 1e-4
+        expected = between if backs else between & (np.arange(500) < 400)
+        np.testing.assert_array_equal(measured, expected)
+        facing = (
+            POSE.rotate(normals) * np.where(np.arange(500) < 400, 1, -1 if backs else 1)[:, None]
+        )
+        np.testing.assert_allclose(planes[:, :3], facing, atol=1e-14)
+
+
+@pytest.mark.parametrize("backs", [False, True])
+@pytest.mark.parametrize("side", [1, -1])
+def test_edge_on_means_a_cosine_below_one_thousandth(side, backs):
+    """Planes through the point that a ray meets at 300 mm, with a cosine of 0.8e-3 to 1.2e-3."""
+    x, y = np.full(201, 0.2), np.full(201, -0.1)
+    point = 300 * np.array([0.2, -0.1, -1.0])
+    across = unit(np.cross(point, [0.0, 1.0, 0.0]))
+    cosine = np.linspace(0.8e-3, 1.2e-3, 201)
+    sine = np.sqrt(1 - cosine**2)
+    normals = side * (sine[:, None] * across - cosine[:, None] * unit(point))
+    local = planes_through(POSE.inverse().apply(np.tile(point, (201, 1))), normals @ POSE.rotation)
+    seen = view(backs=backs)
+    _, measured = seen.depth(x, y, seen.facing(local))
+    clear = np.abs(cosine - 1e-3) > 1e-9
+    expected = (cosine > 1e-3) & (backs or side == 1)
+    np.testing.assert_array_equal(measured[clear], expected[clear])
+
+
+def test_a_face_without_a_normal_is_met_by_no_ray():
+    seen = view()
+    depth, measured = seen.depth(np.zeros(3), np.ones(3), seen.facing(np.zeros((3, 4))))
+    assert not np.isfinite(depth).any()
+    assert not measured.any()
+
+
+def test_more_planes_than_are_turned_at_once():
+    rng = np.random.default_rng(0)
+    count = 2 * PLANES_AT_ONCE + 5
+    normals = unit(rng.normal(size=(count, 3)))
+    distance = rng.uniform(-90, 90, count)
+    turned = view().facing(np.column_stack([normals, distance]))
+    np.testing.assert_allclose(turned[:, :3], POSE.rotate(normals), atol=1e-14)
+    # the camera's distance from each plane, in the part's frame
+    expected = distance - normals @ POSE.inverse().translation
+    np.testing.assert_allclose(turned[:, 3], expected, atol=1e-11)
+
+
+def test_what_is_not_measured_is_left_out_and_no_memory_is_kept():
+    seen = view()
+    eye = POSE.inverse().translation
+    row, column = np.array([3, 3, 9, 200], np.int32), np.array([5, 6, 0, 319], np.int32)
+    towards = POSE.inverse().rotate(CAMERA.ray_directions(column, row))
+    ranges = np.array([200.0, 50.0, 300.0, 400.0])  # the second is before the near plane
+    local = planes_through(eye + ranges[:, None] * towards, -towards)
+    measured = MeasuredPixels(1000)
+    for some in (slice(0, 3), slice(3, 4)):
+        measured.add(
+            seen,
+            row[some],
+            column[some],
+            np.arange(10, 14, dtype=np.int32)[some],
+            seen.facing(local[some]),
+        )
+    measured.cut()
+    kept = [0, 2, 3]
+    np.testing.assert_array_equal(measured.face, [10, 12, 13])
+    np.testing.assert_array_equal(measured.pixel, [3 * 320 + 5, 9 * 320, 200 * 320 + 319])
+    expected = ranges[:, None] * CAMERA.ray_directions(column, row)
+    np.testing.assert_allclose(measured.points, expected[kept], rtol=1e-6)  # f32
+    np.testing.assert_allclose(
+        measured.normals, -CAMERA.ray_directions(column, row)[kept], atol=1e-7
+    )
+    for array in (measured.points, measured.normals, measured.face, measured.pixel):
+        assert array.flags.owndata
+        assert array.flags.c_contiguous

@@ -1,0 +1,89 @@
+"""The loop that takes its gradient as it runs, against the same loop in plain reverse mode."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vanejax.training.gradient_accumulation import accumulate
+
+EXACT = 1e-6  # f32 eps x 10
+
+
+def body(shared, carry, x):
+    """Every part of it counts: two leaves, the carry, and something on the side."""
+    value = jnp.sum(jnp.sin(shared["a"] * x) * carry) + shared["b"] ** 2
+    return value, carry + jnp.cos(x), {"twice": 2 * value}
+
+
+def plain(shared, carry, xs):
+    total, aux = 0.0, []
+    for x in xs:
+        value, carry, twice = body(shared, carry, x)
+        total += value
+        aux.append(twice["twice"])
+    return total, carry, jnp.stack(aux)
+
+
+@pytest.fixture
+def arguments():
+    rng = np.random.default_rng(0)
+    shared = {"a": jnp.asarray(rng.normal(size=3), jnp.float32), "b": jnp.float32(0.7)}
+    return shared, jnp.ones(3), jnp.asarray(rng.normal(size=(4, 3)), jnp.float32)
+
+
+def test_values_carry_and_aux_are_those_of_the_loop(arguments):
+    total, carry, aux = jax.jit(lambda *a: accumulate(body, *a))(*arguments)
+    expected = plain(*arguments)
+    np.testing.assert_allclose(total, expected[0], atol=EXACT)
+    np.testing.assert_allclose(carry, expected[1], atol=EXACT)
+    np.testing.assert_allclose(aux["twice"], expected[2], atol=EXACT)
+
+
+def test_the_gradient_is_that_of_the_loop_in_reverse(arguments):
+    """Scaled by what comes after, and with the values on the side as they were."""
+
+    def loss(function, shared):
+        total, _, aux = function(shared, *arguments[1:])
+        return jnp.tanh(0.1 * total), aux
+
+    (value, aux), found = jax.jit(
+        jax.value_and_grad(lambda s: loss(lambda *a: accumulate(body, *a), s), has_aux=True)
+    )(arguments[0])
+    (expected, twice), gradient = jax.value_and_grad(lambda s: loss(plain, s), has_aux=True)(
+        arguments[0]
+    )
+    np.testing.assert_allclose(value, expected, atol=EXACT)
+    np.testing.assert_allclose(aux["twice"], twice, atol=EXACT)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=EXACT), found, gradient)
+
+
+def test_loops_nest_and_batch(arguments):
+    """As a batch of pairs whose iterations are a loop of their own does."""
+    shared, carry, xs = arguments
+
+    def pair(shared, carry, x):
+        total, _, aux = accumulate(body, shared, carry, jnp.stack([x, 2 * x]))
+        return total, carry, aux["twice"]
+
+    def batch(shared):
+        totals = jax.vmap(lambda x: accumulate(pair, shared, carry, jnp.stack([x, x + 1]))[0])(xs)
+        return jnp.sum(totals * jnp.arange(1.0, 5.0))
+
+    def slow(shared):
+        total = 0.0
+        for weight, x in zip((1.0, 2.0, 3.0, 4.0), xs, strict=True):
+            for y in (x, x + 1):
+                total += weight * plain(shared, carry, jnp.stack([y, 2 * y]))[0]
+        return total
+
+    found, expected = jax.jit(jax.value_and_grad(batch))(shared), jax.value_and_grad(slow)(shared)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), found, expected)
+
+
+def test_only_what_is_shared_is_differentiated(arguments):
+    shared, carry, xs = arguments
+    gradient = jax.jit(jax.grad(lambda c, x: accumulate(body, shared, c, x)[0], (0, 1)))(carry, xs)
+    assert not any(np.any(leaf) for leaf in gradient)

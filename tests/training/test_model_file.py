@@ -1,0 +1,377 @@
+"""A trained matcher in one file: what goes in comes out, and nothing else is taken."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.configs.smoke import get_config
+from experiments.evaluate import load_variables
+from experiments.runner.experiment import Experiment
+from experiments.runner.run_folder import RunFolder
+from vanejax.cad.part import Part, part_from_mesh
+from vanejax.errors import InputError
+from vanejax.matching.rpmnet import RpmNet
+from vanejax.pointcloud import PointCloud
+from vanejax.training.checkpoint import Checkpoints
+from vanejax.training.dataset import ScanSet, make_scan_set
+from vanejax.training.export import export_workdir
+from vanejax.training.train_step import TrainState
+from vanejax.training.weight_file import (
+    TrainedMatcher,
+    abstract_variables,
+    load_model,
+    save_model,
+    weights_by_name,
+)
+
+
+@pytest.fixture(scope="module")
+def config() -> Experiment:
+    config = get_config()
+    config.views.azimuths_deg = (0.0, 20.0)
+    config.views.elevations_deg = (60.0,)
+    return config
+
+
+@pytest.fixture(scope="module")
+def part(config: Experiment) -> Part:
+    return config.make_part()
+
+
+@pytest.fixture(scope="module")
+def scans(config: Experiment, part: Part) -> ScanSet:
+    return make_scan_set(
+        part,
+        config.make_camera(),
+        config.make_viewpoints(part),
+        voxel_mm=config.data.voxel_mm,
+        progress=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def workdir(config: Experiment, part: Part, scans: ScanSet, tmp_path_factory) -> Path:
+    """As experiments.train leaves it: step 10 is the best, step 20 the last, and they differ."""
+    path = tmp_path_factory.mktemp("run")
+    with RunFolder(path) as folder:
+        folder.claim(config, part)
+        scans.save(path / "scans.npz")
+        rng = np.random.default_rng(0)
+        variables = jax.tree.map(
+            lambda leaf: jnp.asarray(0.1 * rng.normal(size=leaf.shape), leaf.dtype),
+            abstract_variables(config.make_network().model),
+        )
+        state = TrainState(
+            step=jnp.asarray(0, jnp.int32),
+            variables=variables,
+            average=variables,
+            opt_state=config.make_optimizer().init(variables),
+        )
+        with Checkpoints(folder.checkpoints) as checkpoints:
+            for step, score in ((10, 1.0), (20, 2.0)):
+                average = jax.tree.map(lambda leaf, step=step: leaf + 0.01 * step, state.variables)
+                checkpoints.save(
+                    state.replace(step=jnp.asarray(step, jnp.int32), average=average), score=score
+                )
+    return path
+
+
+@pytest.fixture(scope="module")
+def exported(workdir: Path, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("exported") / "vane.npz"
+    export_workdir(workdir, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def matcher(exported: Path) -> TrainedMatcher:
+    return load_model(exported)
+
+
+def assert_same_weights(found: Any, wanted: Any) -> None:
+    one, other = weights_by_name(found), weights_by_name(wanted)
+    assert one.keys() == other.keys()
+    assert len(one) == 52
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, other[name], err_msg=name)
+
+
+def test_an_export_holds_the_run(
+    matcher: TrainedMatcher, config: Experiment, scans: ScanSet, part: Part, workdir: Path
+) -> None:
+    assert matcher.model == config.make_network().model
+    assert matcher.drawing == config.make_drawing(scans)
+    assert matcher.iterations == config.model.test_iterations
+    assert matcher.voxel_mm == config.data.voxel_mm
+    assert matcher.camera == config.make_camera()
+    np.testing.assert_array_equal(matcher.center, part.center)
+    assert matcher.radius_mm == part.radius
+    np.testing.assert_array_equal(matcher.reference_points, scans.reference_points)
+    np.testing.assert_array_equal(matcher.reference_normals, scans.reference_normals)
+    assert (matcher.part_name, matcher.part_sha256) == (part.name, part.sha256)
+    assert matcher.trained["step"] == 10
+    assert "jax" in matcher.trained["versions"]
+    matcher.check_part(part)
+
+
+@pytest.mark.parametrize(
+    ("which", "theirs", "step"), [("best", "best", 10), ("last", "latest", 20)]
+)
+def test_the_weights_are_those_that_evaluate_takes(
+    workdir: Path, tmp_path: Path, config, scans, which: str, theirs: str, step: int
+) -> None:
+    written = export_workdir(workdir, tmp_path / "vane.npz", checkpoint=which)
+    found = load_model(tmp_path / "vane.npz")
+    assert found.trained["step"] == written.trained["step"] == step
+    assert_same_weights(found.variables, load_variables(config, scans, workdir, which=theirs))
+
+
+def test_an_export_only_reads_the_run(workdir: Path, tmp_path: Path) -> None:
+    def look() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in workdir.rglob("*") if path.is_file()}
+
+    before = look()
+    export_workdir(workdir, tmp_path / "vane.npz")
+    assert look() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["vane.npz"]
+
+
+def test_what_is_loaded_computes_what_the_run_does(
+    matcher: TrainedMatcher, config: Experiment, scans: ScanSet, workdir: Path
+) -> None:
+    xyz = ((matcher.reference_points - matcher.center) / matcher.radius_mm)[:100]
+    cloud = PointCloud.create(
+        jnp.asarray(xyz, jnp.float32), jnp.asarray(matcher.reference_normals[:100])
+    )
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def features(model: RpmNet, variables: Any) -> jax.Array:
+        return model.apply(variables, cloud, method="features")
+
+    variables = load_variables(config, scans, workdir, which="best")
+    found = features(matcher.model, matcher.variables)
+    np.testing.assert_array_equal(found, features(config.make_network().model, variables))
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-5)  # f32
+
+
+def test_saving_what_was_loaded_changes_nothing(matcher: TrainedMatcher, tmp_path: Path) -> None:
+    save_model(tmp_path / "again.npz", matcher)
+    again = load_model(tmp_path / "again.npz")
+    assert_same_weights(again.variables, matcher.variables)
+    for field in dataclasses.fields(TrainedMatcher):
+        if field.name != "variables":
+            one, other = getattr(again, field.name), getattr(matcher, field.name)
+            np.testing.assert_array_equal(one, other, err_msg=field.name)
+
+
+def test_another_part_is_refused_by_name(matcher: TrainedMatcher) -> None:
+    corners = np.array([[0, 0, 0], [50, 0, 0], [0, 50, 0], [0, 0, 50.0]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    wedge = part_from_mesh(corners, faces, name="wedge")
+    with pytest.raises(InputError) as caught:
+        matcher.check_part(wedge)
+    words = (matcher.part_name, matcher.part_sha256[:12], "wedge", wedge.sha256[:12])
+    assert all(word in str(caught.value) for word in words)
+
+
+def rewrite(
+    path: Path,
+    out: Path,
+    change: Callable[[dict[str, np.ndarray]], None],
+    *,
+    compression: int = zipfile.ZIP_STORED,
+) -> None:
+    """Copies the file with its arrays changed."""
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    change(arrays)
+    with zipfile.ZipFile(out, "w", compression) as archive:
+        for name, array in arrays.items():
+            data = io.BytesIO()
+            np.lib.format.write_array(data, array)
+            archive.writestr(f"{name}.npy", data.getvalue())
+
+
+def set_header(*path: str, to: Any) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(arrays: dict[str, np.ndarray]) -> None:
+        header = json.loads(arrays["header"].tobytes())
+        place = header
+        for name in path[:-1]:
+            place = place[name]
+        if to is None:
+            del place[path[-1]]
+        else:
+            place[path[-1]] = copy.deepcopy(to)
+        arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+
+    return change
+
+
+def set_array(name: str, to: Callable[[np.ndarray], np.ndarray]) -> Callable:
+    return lambda arrays: arrays.update({name: to(arrays[name])})
+
+
+KERNEL = "params/feature_net/prepool_0/dense/kernel"
+BIAS = "params/feature_net/prepool_0/dense/bias"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda arrays: None, None),
+        (lambda arrays: arrays.pop(KERNEL), f"missing: {KERNEL}"),
+        (lambda arrays: arrays.update(more=np.zeros(3, np.float32)), "unknown: more"),
+        (set_array(KERNEL, lambda x: x.T.copy()), rf"{KERNEL} is float32 \(32, 10\).*\(10, 32\)"),
+        (set_array(KERNEL, lambda x: x.astype(np.float64)), f"{KERNEL} is float64"),
+        (set_array(BIAS, lambda x: x * np.nan), f"{BIAS} holds values that are not finite"),
+        (set_array("reference_points", lambda x: x[:, :2]), "should both be"),
+        (set_array("reference_normals", lambda x: x.astype(np.float16)), "not float32"),
+        (
+            lambda arrays: arrays.update(
+                {name: arrays[name][:100] for name in ("reference_points", "reference_normals")}
+            ),
+            "100 reference points, fewer than the 256",
+        ),
+        (lambda arrays: arrays.pop("header"), "no weights of vanejax"),
+        (set_array("header", lambda x: x[:50]), "no weights of vanejax"),
+        (set_header("format", to="other"), "no weights of vanejax"),
+        (set_header("version", to=2), "version 2, this program reads 1"),
+        (set_header("camera", to=None), "header has no camera"),
+        (set_header("camera", "width", to=-5), "camera: camera width"),
+        (set_header("model", "feature_width", to=10**12), "feature_width=10+ should be int"),
+        (set_header("model", "feature_width", to=33), "feature_width=33 is no multiple of 8"),
+        (set_header("model", "feature_width", to=64), r"the network's is float32"),
+        (set_header("model", "num_neighbors", to=True), "num_neighbors=True should be int"),
+        (set_header("model", "depth", to=3), "model: has .*'depth'"),
+        (set_header("drawing", "noise", to=None), "drawing: has"),
+        (set_header("drawing", "noise", to="0.1"), "noise='0.1' should be float"),
+        (set_header("iterations", to=0), "iterations=0 should be int, from 1"),
+        (set_header("voxel_mm", to=float("nan")), "voxel_mm=nan"),
+        (set_header("part", to=[]), "center_mm=None"),
+        (set_header("part", "center_mm", to=[0, 0, "1"]), "center_mm='1'"),
+        (set_header("part", "sha256", to=5), "name and sha256 should be text"),
+    ],
+)
+def test_a_changed_file_is_refused_by_what_changed(
+    exported: Path, tmp_path: Path, change: Callable, words: str | None
+) -> None:
+    path = tmp_path / "changed.npz"
+    rewrite(exported, path, change)
+    if words is None:  # or the other cases would say nothing
+        load_model(path)
+        return
+    with pytest.raises(InputError, match=words) as caught:
+        load_model(path)
+    assert str(path) in str(caught.value)
+
+
+def test_bombs_and_lies_are_refused(exported: Path, tmp_path: Path) -> None:
+    path = tmp_path / "bad.npz"
+    rewrite(
+        exported,
+        path,
+        lambda arrays: arrays.update(bomb=np.zeros(1 << 24, np.float32)),
+        compression=zipfile.ZIP_DEFLATED,
+    )
+    assert path.stat().st_size < 10_000_000
+    with pytest.raises(InputError, match="compressed"):
+        load_model(path)
+
+    promise = io.BytesIO()
+    header = {"descr": "<f4", "fortran_order": False, "shape": (10**12,)}
+    np.lib.format.write_array_header_1_0(promise, header)
+    plain = promise.getvalue()
+    contents = {
+        plain + b"1234": "does not hold the array that it announces",
+        plain.replace(b"'shape'", b"'shape"): "truncated or no weights",
+        plain.replace(b"(1000000000000,)", b"(((((((((((((((("): "truncated or no weights",
+        plain.replace(b"1000000000000", b"-3333333333.5"): "truncated or no weights",
+        plain[:6] + b"\x09\x00" + plain[8:]: "array format",
+    }
+    for content, words in contents.items():
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("header.npy", content)
+        with pytest.raises(InputError, match=words):
+            load_model(path)
+
+    class Evil:
+        def __reduce__(self):
+            return (pytest.fail, ("unpickled",))
+
+    np.savez(path, header=np.array([Evil()], object))
+    with pytest.raises(InputError, match=r"announces|truncated"):
+        load_model(path)
+
+
+def test_a_file_cut_off_or_of_another_kind_is_refused(exported: Path, tmp_path: Path) -> None:
+    path, whole = tmp_path / "bad.npz", exported.read_bytes()
+    damaged = bytearray(whole)
+    damaged[len(whole) // 2] ^= 1
+    for content in (b"", b"hello", whole[:100], whole[: len(whole) // 2], whole[:-1], damaged):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"bad\.npz: truncated or no weights"):
+            load_model(path)
+    np.savez(path, a=np.zeros(3))
+    with pytest.raises(InputError, match="no weights of vanejax"):
+        load_model(path)
+    with pytest.raises(InputError, match="no such file"):
+        load_model(tmp_path / "none.npz")
+    with pytest.raises(InputError, match="is a folder"):
+        load_model(tmp_path)
+
+
+def test_what_cannot_be_loaded_is_not_saved(matcher: TrainedMatcher, tmp_path: Path) -> None:
+    broken = jax.tree.map(lambda leaf: leaf * np.float32(np.nan), matcher.variables)
+    with pytest.raises(InputError, match="not finite"):
+        save_model(tmp_path / "bad.npz", dataclasses.replace(matcher, variables=broken))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_no_run_is_refused(workdir: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.npz"
+
+    def refuse(words: str, folder: Path = tmp_path / "run", **options: Any) -> None:
+        with pytest.raises(InputError, match=words):
+            export_workdir(folder, out, **options)
+        assert not out.exists()
+
+    refuse("no such folder", tmp_path / "none")
+    run = tmp_path / "run"
+    run.mkdir()
+    refuse("run.json: no such file")
+    (run / "run.json").write_text("{")
+    refuse("cannot be read as JSON")
+    (run / "run.json").write_text("[]")
+    refuse("does not say which config and part")
+    record = json.loads((workdir / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps(record))
+    refuse(r"scans\.npz: no such file")
+    (run / "scans.npz").symlink_to(workdir / "scans.npz")
+    refuse("holds no checkpoints")
+    (run / "checkpoints").mkdir()
+    refuse("no checkpoint", checkpoint="last")
+    wide = copy.deepcopy(record)
+    wide["config"]["model"]["feature_width"] = 64
+    (run / "run.json").write_text(json.dumps(wide))
+    (run / "checkpoints").rmdir()
+    (run / "checkpoints").symlink_to(workdir / "checkpoints")
+    refuse("another config")
+    del wide["config"]["data"]["noise"]
+    (run / "run.json").write_text(json.dumps(wide))
+    refuse("has no 'noise'")
+    record["part"]["sha256"] = "0" * 64
+    (run / "run.json").write_text(json.dumps(record))
+    refuse("mixes two runs")

@@ -1,0 +1,269 @@
+"""ModelNet40 in both layouts, on tiny copies made by hand: what is read, and what is refused."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vanejax.errors import InputError
+from vanejax.training.modelnet40 import ModelNet40, read_modelnet40, read_off
+
+CUBE = """OFF
+# a cube of side 2 about (5, 0, 0), of quadrilaterals
+8 6 12
+4 -1 -1
+6 -1 -1
+6 1 -1
+4 1 -1
+4 -1 1
+6 -1 1
+6 1 1
+4 1 1
+4 3 2 1 0
+4 4 5 6 7
+4 0 1 5 4
+4 1 2 6 5
+4 2 3 7 6
+4 3 0 4 7
+"""
+TETRAHEDRON = "OFF4 4 6\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
+
+
+def read(folder: Path, **settings) -> ModelNet40:
+    defaults = {"split": "train", "categories": "all", "seed": 0, "num_points": 64}
+    return read_modelnet40(folder, **(defaults | settings))
+
+
+@pytest.fixture
+def off_tree(tmp_path: Path) -> Path:
+    shapes = {"airplane": TETRAHEDRON, "lamp": CUBE, "laptop": TETRAHEDRON, "xbox": CUBE}
+    for category, text in shapes.items():
+        for split, numbers in (("train", (1, 2)), ("test", (3,))):
+            folder = tmp_path / "ModelNet40" / category / split
+            folder.mkdir(parents=True)
+            for number in numbers:
+                (folder / f"{category}_{number:04d}.off").write_text(text)
+    (tmp_path / "ModelNet40" / "lamp" / "train" / "._lamp_0001.off").write_bytes(b"\x00\x05\x16")
+    return tmp_path
+
+
+def test_off_meshes_become_samples_in_the_unit_sphere(off_tree: Path):
+    found = read(off_tree / "ModelNet40")
+    assert (found.layout, found.split_size) == ("OFF", 8)
+    assert found.names[:3] == ["airplane_0001", "airplane_0002", "lamp_0001"]
+    assert found.samples.shape == (8, 64, 6)
+    assert found.samples.dtype == np.float32
+    points, normals = found.samples[2, :, :3], found.samples[2, :, 3:]
+    # the cube's corners are at 1: its sides at 1 / sqrt(3), and its normals along the axes
+    np.testing.assert_allclose(np.abs(points).max(axis=1), 1 / np.sqrt(3), atol=1e-6)
+    side = np.sign(points) * (np.abs(points) > 1 / np.sqrt(3) - 1e-6)
+    np.testing.assert_allclose(normals, side, atol=1e-6)
+    assert len(np.unique(side, axis=0)) == 6
+    # the folder that holds it does too
+    np.testing.assert_array_equal(read(off_tree).samples, found.samples)
+
+
+def test_a_shape_is_sampled_alike_whatever_others_are_there(off_tree: Path):
+    every, some = read(off_tree), read(off_tree, categories="last 20")
+    np.testing.assert_array_equal(every.samples[4:], some.samples)
+    assert np.abs(read(off_tree, seed=1).samples - every.samples).max() > 0.1
+    # the same mesh under another name is sampled anew
+    assert np.abs(every.samples[0] - every.samples[1]).max() > 0.1
+
+
+def test_halves_are_rpm_net_s_also_in_a_partial_copy(off_tree: Path):
+    first, last = read(off_tree, categories="first 20"), read(off_tree, categories="last 20")
+    assert first.names == ["airplane_0001", "airplane_0002", "lamp_0001", "lamp_0002"]
+    assert last.names == ["laptop_0001", "laptop_0002", "xbox_0001", "xbox_0002"]
+    assert first.split_size == last.split_size == 8
+    assert read(off_tree, split="test", categories="first 20").names == [
+        "airplane_0003",
+        "lamp_0003",
+    ]
+
+
+def test_headers_that_run_into_the_counts_are_read(tmp_path: Path):
+    run_in, apart = tmp_path / "in.off", tmp_path / "apart.off"
+    run_in.write_text(TETRAHEDRON)
+    apart.write_text(TETRAHEDRON.replace("OFF4", "OFF\n4"))
+    found, expected = read_off(run_in), read_off(apart)
+    assert found.sha256 == expected.sha256
+    assert len(found.mesh.faces) == 4
+    np.testing.assert_allclose(found.triangles.volume(), 1 / 6)
+
+
+def test_polygons_become_triangles_of_the_same_area_and_volume(tmp_path: Path):
+    (tmp_path / "cube.off").write_text(CUBE)
+    part = read_off(tmp_path / "cube.off")
+    np.testing.assert_allclose(part.triangles.areas().sum(), 24)
+    np.testing.assert_allclose(part.triangles.volume(), 8)
+    np.testing.assert_allclose(part.center, [5, 0, 0])
+
+
+def test_vertices_that_no_face_uses_do_not_scale_the_shape(tmp_path: Path):
+    text = TETRAHEDRON.replace("OFF4 4 6\n", "OFF 5 4 6\n").replace("3 0 2 1", "900 0 0\n3 0 2 1")
+    (tmp_path / "stray.off").write_text(text)
+    assert read_off(tmp_path / "stray.off").radius < 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("solid x", "does not start with OFF"),
+        ("OFF", "no counts"),
+        ("OFF\n4 x 6", "something else than numbers"),
+        ("OFF\n4 4 nan", "not finite"),
+        ("OFF\n-4 4 6", "cut short"),
+        ("OFF\n9999999999 4 6\n0 0 0", "cut short"),
+        (TETRAHEDRON[:-8], "4 faces are announced, 3 can be read"),
+        (TETRAHEDRON + "3 0 1 2\n", "4 faces are announced, 4 can be read, 4 numbers are left"),
+        (TETRAHEDRON.replace("3 1 2 3", "3 1 2 4"), "points at no vertex"),
+        (TETRAHEDRON.replace("3 1 2 3", "3 1 2 -1"), "points at no vertex"),
+        (TETRAHEDRON.replace("1 0 0", "inf 0 0"), "not finite"),
+        ("OFF\n3 1 0\n0 0 0\n1 0 0\n2 0 0\n3 0 1 2\n", "no area"),
+        ("OFF\n3 0 0\n0 0 0\n1 0 0\n2 0 0\n", "no faces"),
+    ],
+)
+def test_broken_off_files_are_refused(tmp_path: Path, text: str, message: str):
+    path = tmp_path / "broken.off"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_off(path)
+
+
+def test_what_is_not_there(tmp_path: Path):
+    with pytest.raises(InputError, match=r"no such folder\. Obtain modelnet40_ply.*nothing is dow"):
+        read(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="holds no ModelNet40"):
+        read(tmp_path)
+    with pytest.raises(InputError, match="no split 'validation'"):
+        read(tmp_path, split="validation")
+    with pytest.raises(InputError, match="no categories '20'"):
+        read(tmp_path, categories="20")
+
+
+def test_hdf5_without_h5py_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "shape_names.txt").write_text("lamp\n")
+    (tmp_path / "ply_data_train0.h5").write_bytes(b"")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(InputError, match=r"pip install 'vanejax\[modelnet\]'"):
+        read(tmp_path)
+
+
+LABELS = {"train0": [3, 0, 1], "train1": [2, 1], "test0": [0]}
+
+
+@pytest.fixture
+def hdf5_folder(tmp_path: Path) -> Path:
+    """Two training files, listed out of order and by the paths of another machine."""
+    h5py = pytest.importorskip("h5py", reason="the extra vanejax[modelnet] is not installed")
+    folder = tmp_path / "modelnet40_ply_hdf5_2048"
+    folder.mkdir()
+    (folder / "shape_names.txt").write_text("airplane\nlamp\nlaptop\nxbox\n")
+    listed = "data/modelnet40_ply_hdf5_2048/ply_data_{}.h5\n"
+    (folder / "train_files.txt").write_text(listed.format("train1") + listed.format("train0"))
+    rng = np.random.default_rng(0)
+    for name, labels in LABELS.items():
+        with h5py.File(folder / f"ply_data_{name}.h5", "w") as file:
+            for what in ("data", "normal"):
+                values = rng.normal(size=(len(labels), 100, 3)).astype(np.float32)
+                values /= np.linalg.norm(values, axis=2, keepdims=True)
+                file.create_dataset(what, data=values, compression="gzip")
+            file["label"] = np.array(labels, np.uint8)[:, None]
+    return folder
+
+
+def rewrite(folder: Path, **datasets: np.ndarray | None) -> None:
+    """Replaces or removes datasets of the first training file."""
+    import h5py
+
+    with h5py.File(folder / "ply_data_train0.h5", "a") as file:
+        for name, values in datasets.items():
+            del file[name]
+            if values is not None:
+                file[name] = values
+
+
+def test_hdf5_shapes_are_read_as_stored_in_the_listed_order(hdf5_folder: Path):
+    import h5py
+
+    found = read(hdf5_folder, num_points=4096)
+    assert (found.layout, found.split_size) == ("HDF5", 5)
+    expected = [
+        "laptop train 0",
+        "lamp train 1",
+        "xbox train 2",
+        "airplane train 3",
+        "lamp train 4",
+    ]
+    assert found.names == expected
+    with h5py.File(hdf5_folder / "ply_data_train0.h5") as file:
+        np.testing.assert_array_equal(found.samples[2:, :, :3], file["data"])
+        np.testing.assert_array_equal(found.samples[2:, :, 3:], file["normal"])
+    # from the folder that holds it, and without the list, in the order of names
+    assert read(hdf5_folder.parent).names == expected
+    (hdf5_folder / "train_files.txt").unlink()
+    assert read(hdf5_folder).names[0] == "xbox train 0"
+
+
+def test_hdf5_halves_and_splits(hdf5_folder: Path):
+    every = read(hdf5_folder)
+    first = read(hdf5_folder, categories="first 20")
+    assert first.names == ["lamp train 1", "airplane train 3", "lamp train 4"]
+    assert first.split_size == 5
+    assert read(hdf5_folder, split="test").names == ["airplane test 0"]
+    with pytest.raises(InputError, match="no test shapes of the last 20"):
+        read(hdf5_folder, split="test", categories="last 20")
+    whole = read(hdf5_folder, num_points=100).samples
+    assert every.samples.shape == (5, 64, 6)
+    for some, shape in zip(every.samples, whole, strict=True):
+        rows = [np.flatnonzero((shape == row).all(axis=1)) for row in some]
+        assert len(np.unique(np.concatenate(rows))) == 64  # of the shape's own, none twice
+    assert np.abs(every.samples[0] - whole[0, :64]).max() > 0.1  # not just the first
+
+
+def test_broken_hdf5_folders_are_refused(hdf5_folder: Path):
+    (hdf5_folder / "ply_data_train1.h5").rename(hdf5_folder / "away.h5")
+    with pytest.raises(InputError, match=r"lacks ply_data_train1\.h5"):
+        read(hdf5_folder)
+    (hdf5_folder / "ply_data_train1.h5").write_bytes(b"no HDF5")
+    with pytest.raises(InputError, match=r"ply_data_train1\.h5: cannot be read as HDF5"):
+        read(hdf5_folder)
+    (hdf5_folder / "shape_names.txt").unlink()
+    with pytest.raises(InputError, match=r"shape_names\.txt: missing"):
+        read(hdf5_folder)
+
+
+@pytest.mark.parametrize(
+    ("datasets", "message"),
+    [
+        ({"normal": None}, "no dataset 'normal'"),
+        ({"data": np.zeros((3, 100, 2), np.float32)}, r"\(3, 100, 2\), not \[S, P, 3\]"),
+        ({"normal": np.zeros((3, 99, 3), np.float32)}, "do not belong"),
+        ({"label": np.zeros(2, np.uint8)}, "do not belong"),
+        ({"label": np.full(3, 4, np.uint8)}, r"outside 0\.\.3"),
+        ({"label": np.zeros(3, np.float32)}, r"outside 0\.\.3"),
+        ({"data": np.zeros((3, 100, 3), np.int32)}, "floating-point"),
+        (
+            {k: np.zeros((3, 9, 3), np.float32) for k in ("data", "normal")},
+            "different numbers of points",
+        ),
+    ],
+)
+def test_broken_hdf5_datasets_are_refused(hdf5_folder: Path, datasets, message: str):
+    rewrite(hdf5_folder, **datasets)
+    with pytest.raises(InputError, match=message):
+        read(hdf5_folder)
+
+
+def test_a_promise_of_more_than_memory_holds_is_refused(hdf5_folder: Path):
+    import h5py
+
+    with h5py.File(hdf5_folder / "ply_data_train0.h5", "a") as file:
+        del file["data"]
+        file.create_dataset("data", (2**40, 100, 3), "f4", compression="gzip")
+    with pytest.raises(InputError, match="announces"):
+        read(hdf5_folder)

@@ -1,0 +1,26 @@
+"""From a CAD file to a `Part`.
+
+In: STL, OBJ, PLY, GLB or STEP, in any unit; or the parameters of a guide vane. Out: a `Part`, a
+closed solid in millimetres in a fixed order of faces, with samples of its surface, nearest points,
+and castings of it that differ from the model as investment castings do.
+"""
+
+from vanejax.cad.investment_casting import Casting, as_cast
+from vanejax.cad.nearest_face import NearestFace
+from vanejax.cad.parametric_vane import GuideVaneSegment, guide_vane
+from vanejax.cad.part import Part, load_part, part_from_mesh
+from vanejax.cad.surface import Surface
+from vanejax.cad.triangles import Triangles
+
+__all__ = [
+    "Casting",
+    "GuideVaneSegment",
+    "NearestFace",
+    "Part",
+    "Surface",
+    "Triangles",
+    "as_cast",
+    "guide_vane",
+    "load_part",
+    "part_from_mesh",
+]

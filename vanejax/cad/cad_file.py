@@ -1,0 +1,239 @@
+"""Reading the triangles of CAD files. Whatever a file holds, the answer is arrays or `InputError`.
+
+No count that a file states is trusted before it is held against the bytes that are there, nothing
+is unpickled, textures and materials are not followed, and nothing is written.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from vanejax.cad.mesh_repair import MAX_FACES
+from vanejax.errors import InputError
+
+MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "ft": 304.8, "um": 1e-3}
+"""Units of length and their size in mm."""
+
+SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".gltf", ".step", ".stp")
+MAX_BYTES = 2**30
+
+# 0.01 mm between a curved face and its triangles, and 0.1 rad (6 deg) between neighbours
+_STEP_TOLERANCE = {"tol_linear": 0.01, "tol_angular": 0.1}
+
+
+def read_triangles(path: Path, *, units: str) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """The triangles of a file, unchecked but for what reading needs.
+
+    Args:
+      path: an STL, OBJ, PLY, GLB, GLTF or STEP file; all bodies in it are put together.
+      units: unit of the numbers in the file, a key of `MM_PER_UNIT`.
+
+    Returns:
+      vertices [V, 3] f64 in mm, not necessarily finite; faces [F, 3] i32 or i64, not necessarily
+      closed; a sentence per oddity that was passed over.
+
+    Raises:
+      InputError: the file is missing, empty, truncated, too large or of another kind.
+    """
+    if units not in MM_PER_UNIT:
+        raise InputError(f"unknown unit {units!r}; use one of {', '.join(MM_PER_UNIT)}")
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; give the CAD file in it")
+    if not path.exists():
+        raise InputError(f"{path}: no such file (looked in {path.parent.absolute()})")
+    if suffix not in SUFFIXES:
+        raise InputError(
+            f"{path}: cannot read {suffix or 'a file without suffix'}; use one of "
+            + ", ".join(SUFFIXES)
+        )
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(
+                f"{path}: {size / 2**30:.1f} GiB are more than {MAX_BYTES / 2**30:.0f} GiB; "
+                "export it with a coarser tolerance (0.01 mm is enough)"
+            )
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    if not data.strip():
+        raise InputError(f"{path}: is empty; export it again")
+    scale = MM_PER_UNIT[units]
+    if suffix == ".stl":
+        vertices, notes = _read_stl(data, path)
+        vertices *= scale
+        return vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), notes
+    if suffix in (".step", ".stp"):
+        data, suffix, scale = _glb_of_step(data, path, units), ".glb", 1000.0  # always metres
+    vertices, faces = _read_scene(data, path, suffix)
+    return vertices * scale, faces, ()
+
+
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def _read_stl(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Corners [3F, 3] f64 in file units of a binary or ASCII STL file."""
+    stated = int.from_bytes(data[80:84], "little") if len(data) >= 84 else 0
+    held = max(len(data) - 84, 0)
+    exact = len(data) >= 84 and held == stated * _FACET.itemsize
+    if not exact and data[:256].lstrip()[:5].lower() == b"solid":
+        return _read_ascii_stl(data, path), ()
+    if not exact and b"\0" not in data[:1024]:
+        raise InputError(f"{path}: is no STL file: it holds neither facets nor binary triangles")
+    if stated * _FACET.itemsize > held or len(data) < 84:
+        raise InputError(
+            f"{path}: truncated: it promises {stated:,} triangles ({stated * 50:,} bytes) and "
+            f"holds {held:,} bytes of them; copy or export it again"
+        )
+    if not stated:
+        raise InputError(f"{path}: an STL file without triangles; export it again")
+    extra = held - stated * _FACET.itemsize
+    corners = np.empty((stated, 3, 3))
+    corners[:] = np.frombuffer(data, _FACET, count=stated, offset=84)["corners"]
+    notes = (f"passed over {extra} bytes after the last triangle",) if extra else ()
+    return corners.reshape(-1, 3), notes
+
+
+def _read_ascii_stl(data: bytes, path: Path) -> np.ndarray:
+    """Corners [3F, 3] f64 of the text form of STL."""
+    lines = re.findall(rb"\bvertex\s+([^\r\n]*)", data, re.IGNORECASE)
+    if not lines:
+        raise InputError(f"{path}: an STL file without triangles, or another text; export it again")
+    if len(lines) > 3 * MAX_FACES:
+        raise InputError(
+            f"{path}: {len(lines) // 3:,} triangles are more than {MAX_FACES:,}; export it with a "
+            "coarser tolerance (0.01 mm is enough)"
+        )
+    facets = len(re.findall(rb"\bendfacet\b", data, re.IGNORECASE))
+    if 3 * facets != len(lines) or not re.search(rb"\bendsolid\b", data[-2048:], re.IGNORECASE):
+        raise InputError(
+            f"{path}: truncated or damaged: {len(lines)} vertices in {facets} complete facets"
+            f"{'' if b'endsolid' in data[-2048:].lower() else ', no endsolid at the end'}; "
+            "copy or export it again"
+        )
+    try:
+        corners = np.loadtxt(lines, np.float64, comments=None, ndmin=2)
+    except ValueError as error:
+        raise InputError(f"{path}: a vertex is not three numbers: {error}") from error
+    if corners.shape[1] != 3:
+        raise InputError(f"{path}: a vertex has {corners.shape[1]} numbers instead of 3")
+    return corners
+
+
+def _read_scene(data: bytes, path: Path, suffix: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [F, 3] of every mesh in the file, each where its node puts it."""
+    promised = {".ply": _ply_counts, ".glb": _gltf_counts, ".gltf": _gltf_counts}
+    counts = promised[suffix](data, path) if suffix in promised else {}
+    for element, count in counts.items():
+        # every element takes a byte or more; glTF may keep them in a file beside it
+        if count > (MAX_BYTES if suffix == ".gltf" else len(data)):
+            raise InputError(
+                f"{path}: truncated: it promises {count:,} of {element} in {len(data):,} bytes; "
+                "copy or export it again"
+            )
+    options = {} if suffix == ".ply" else {"skip_materials": True}
+    resolver = trimesh.resolvers.FilePathResolver(str(path)) if suffix == ".gltf" else None
+    try:
+        scene = trimesh.load_scene(
+            io.BytesIO(data), file_type=suffix[1:], resolver=resolver, process=False, **options
+        )
+        placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+        placed = [(matrix, scene.geometry[geometry]) for matrix, geometry in placed]
+    except Exception as error:  # a damaged file can raise anything in a parser
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(
+            f"{path}: is no readable {suffix[1:].upper()} file: {reason}; export it again"
+        ) from error
+    meshes = [(m, g) for m, g in placed if isinstance(g, trimesh.Trimesh) and len(g.faces)]
+    if not meshes:
+        cloud = any(isinstance(g, trimesh.PointCloud) for _, g in placed)
+        raise InputError(
+            f"{path}: holds points but no faces: a scan, not a CAD model; give the CAD file"
+            if cloud
+            else f"{path}: holds no triangles; export the solid body"
+        )
+    faces = sum(len(mesh.faces) for _, mesh in meshes)
+    if faces > MAX_FACES:
+        raise InputError(
+            f"{path}: {faces:,} faces are more than the {MAX_FACES:,} that fit in memory; export "
+            "it with a coarser tolerance (0.01 mm is enough)"
+        )
+    if suffix == ".ply" and len(meshes[0][1].faces) < counts.get("face", 0):
+        raise InputError(
+            f"{path}: truncated: it promises {counts['face']:,} faces and holds "
+            f"{len(meshes[0][1].faces):,}; copy or export it again"
+        )
+    all_vertices, all_faces, start = [], [], 0
+    for matrix, mesh in meshes:
+        all_vertices.append(np.asarray(mesh.vertices) @ matrix[:3, :3].T + matrix[None, :3, 3])
+        all_faces.append(np.asarray(mesh.faces, np.int64) + start)
+        start += len(mesh.vertices)
+    return np.concatenate(all_vertices), np.concatenate(all_faces)
+
+
+def _ply_counts(data: bytes, path: Path) -> dict[str, int]:
+    """How many of each element a PLY header promises."""
+    header = data[: max(data.find(b"end_header"), 0)]
+    if not data.startswith(b"ply") or not header:
+        raise InputError(f"{path}: is no PLY file: it has no header; export it again")
+    found = re.findall(rb"^element\s+(\w+)\s+(\d{1,18})\s*$", header, re.MULTILINE)
+    return {name.decode(): int(count) for name, count in found}
+
+
+def _gltf_counts(data: bytes, path: Path) -> dict[str, int]:
+    """The largest accessor that a GLB or GLTF file promises."""
+    try:
+        if data[:4] == b"glTF":
+            length = int.from_bytes(data[12:16], "little")
+            data = data[20 : 20 + length]
+        accessors = json.loads(data).get("accessors", [])
+        return {"an accessor's elements": max([int(a["count"]) for a in accessors], default=0)}
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise InputError(f"{path}: is no readable glTF file; export it again") from error
+
+
+def _glb_of_step(data: bytes, path: Path, units: str) -> bytes:
+    """GLB, in metres, of a STEP file; OpenCASCADE reads the file's own unit."""
+    if not data[:1024].lstrip().startswith(b"ISO-10303-21"):
+        raise InputError(f"{path}: is no STEP file: it does not start with ISO-10303-21")
+    try:
+        import cascadio
+    except ImportError as error:
+        raise InputError(
+            f"{path}: STEP files need an extra: pip install 'vanejax[step]' (it brings cascadio), "
+            "or export the part as STL"
+        ) from error
+    own = _step_unit(data)
+    if own not in (None, units):
+        raise InputError(
+            f"{path}: the STEP file says that its unit is {own!r}, not {units!r}: use units={own!r}"
+        )
+    glb = cascadio.load(data, file_type="step", **_STEP_TOLERANCE)
+    if not glb:
+        raise InputError(f"{path}: OpenCASCADE finds no shape in this STEP file; export it again")
+    return glb
+
+
+def _step_unit(data: bytes) -> str | None:
+    """The unit of length of a STEP file, None where it names none or several."""
+    names = {"MILLI": "mm", "CENTI": "cm", "MICRO": "um", "": "m", "INCH": "in", "FOOT": "ft"}
+    found = set()
+    for listed in re.findall(rb"GLOBAL_UNIT_ASSIGNED_CONTEXT\s*\(\s*\(([^)]*)\)", data):
+        for entity in re.findall(rb"#\d+", listed):
+            match = re.search(rb"(?<!\w)" + entity + rb"\s*=\s*([^;]*);", data)
+            body = match.group(1).decode("latin-1").upper() if match else ""
+            if "LENGTH_UNIT" not in body:
+                continue
+            si = re.search(r"SI_UNIT\s*\(\s*(?:\.(\w+)\.|\$)\s*,\s*\.METRE\.", body)
+            based = re.search(r"CONVERSION_BASED_UNIT\s*\(\s*'(\w+)'", body)
+            name = (si.group(1) or "") if si else based.group(1) if based else "?"
+            found.add(names.get(name))
+    return found.pop() if len(found) == 1 else None

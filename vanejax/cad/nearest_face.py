@@ -1,0 +1,114 @@
+"""The nearest point of a part's surface, exactly, whatever the size and shape of its faces.
+
+`vanejax.cad.surface.Surface.exact` looks at the faces of a few samples near by. That is quick and
+right
+to a face's size; on the long thin faces of a flat side it can be off by a millimetre. Where a part
+is measured and not registered, the nearest face of all is wanted.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+from trimesh.triangles import closest_point
+
+from vanejax.cad.part import Part
+from vanejax.cad.surface import Feet
+
+PAIRS_AT_ONCE = 1 << 17  # of a point and a face
+FIRST_FACES = 8  # of each size, looked at for each point
+TIE_MM = 1e-9  # feet as near as this are one: rounding at 1 m is 1e-13
+
+
+class NearestFace:
+    """Nearest points on a part's surface, to rounding.
+
+    Faces are sorted by size, a search tree over the middles of each size. A face of radius r about
+    its middle can be no nearer than the middle less r, so that the search ends when the next middle
+    is farther than the best foot and r together.
+
+    Args:
+      part: whose surface.
+    """
+
+    def __init__(self, part: Part) -> None:
+        self._corners = np.asarray(part.mesh.triangles, np.float64)
+        sides = self._corners[:, 1:] - self._corners[:, :1]
+        cross = np.cross(sides[:, 0], sides[:, 1])
+        double_area = np.linalg.norm(cross, axis=1)
+        self._normals = cross / np.where(double_area > 0, double_area, 1.0)[:, None]
+        middles = self._corners.mean(axis=1)
+        self._radii = np.linalg.norm(self._corners - middles[:, None], axis=2).max(axis=1)
+        size = np.ceil(np.log2(np.maximum(self._radii, 1e-6)))
+        # a face without area is the edge of its neighbours
+        some = double_area > 0
+        self._sizes = [np.flatnonzero(some & (size == v)) for v in np.unique(size[some])]
+        self._trees = [cKDTree(middles[faces]) for faces in self._sizes]
+
+    def feet(self, points: np.ndarray) -> Feet:
+        """The nearest surface points of points [N, 3] f64, mm, part frame.
+
+        Where several faces share one, at an edge or a corner, that which faces the point or turns
+        from it most: the side of that face is the side of the solid.
+        """
+        found = [
+            self._some(points[first : first + PAIRS_AT_ONCE // FIRST_FACES])
+            for first in range(0, len(points), PAIRS_AT_ONCE // FIRST_FACES)
+        ]
+        return Feet(
+            np.concatenate([feet.points for feet in found]),
+            np.concatenate([feet.normals for feet in found]),
+            np.concatenate([feet.face for feet in found]),
+        )
+
+    def _some(self, points: np.ndarray) -> Feet:
+        best = np.full(len(points), np.inf)
+        feet = Feet(
+            np.zeros((len(points), 3)), np.zeros((len(points), 3)), np.zeros(len(points), np.int64)
+        )
+        for faces, tree in zip(self._sizes, self._trees, strict=True):
+            largest = self._radii[faces].max()
+            rows, first, last = np.arange(len(points)), 0, min(FIRST_FACES, len(faces))
+            while len(rows):
+                ended = []
+                for some in np.array_split(rows, 1 + len(rows) * last // PAIRS_AT_ONCE):
+                    middle, order = tree.query(points[some], k=range(first + 1, last + 1))
+                    self._look(points, some, faces[order], middle, best, feet)
+                    ended.append(middle[:, -1] - largest > best[some] + TIE_MM)
+                rows = rows[~np.concatenate(ended)] if last < len(faces) else rows[:0]
+                first, last = last, min(2 * last, len(faces))
+        return feet
+
+    def _look(
+        self,
+        points: np.ndarray,
+        rows: np.ndarray,
+        faces: np.ndarray,
+        middle: np.ndarray,
+        best: np.ndarray,
+        feet: Feet,
+    ) -> None:
+        """Takes the faces [n, k] of the points ``rows``, where one is nearer than the best."""
+        row, column = np.nonzero(middle - self._radii[faces] <= best[rows, None] + TIE_MM)
+        if not len(row):
+            return
+        point, face = rows[row], faces[row, column]
+        foot = closest_point(self._corners[face], points[point])
+        off = points[point] - foot
+        distance = np.linalg.norm(off, axis=1)
+        facing = np.abs(np.einsum("ni,ni->n", off, self._normals[face]))
+        nearest = best.copy()
+        np.minimum.at(nearest, point, distance)
+        # the foot that was the best so far stays in the choice
+        known = np.unique(point)
+        known = known[best[known] <= nearest[known] + TIE_MM]
+        point = np.concatenate([point, known])
+        foot = np.concatenate([foot, feet.points[known]])
+        face = np.concatenate([face, feet.face[known]])
+        old = np.abs(np.einsum("ni,ni->n", points[known] - feet.points[known], feet.normals[known]))
+        distance, facing = np.concatenate([distance, best[known]]), np.concatenate([facing, old])
+        tied = np.flatnonzero(distance <= nearest[point] + TIE_MM)
+        tied = tied[np.argsort(facing[tied], kind="stable")]  # the last one written stays
+        which = point[tied]
+        feet.put(which, Feet(foot[tied], self._normals[face[tied]], face[tied]))
+        best[:] = nearest

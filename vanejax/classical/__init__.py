@@ -1,1 +1,0 @@
-"""Classical registration: closest points, robust estimation, sampled features."""

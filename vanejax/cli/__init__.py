@@ -1,0 +1,1 @@
+"""The commands of ``vanejax``: each adds its arguments to a parser, and runs."""

@@ -1,0 +1,283 @@
+"""``vanejax compensate``: where the part sits in the machine, for its controller."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from typing import TYPE_CHECKING
+
+from vanejax.cli import workpiece
+from vanejax.cli.register import EXIT_CODES
+from vanejax.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from vanejax.cad.part import Part
+    from vanejax.machine.controllers import Compensation
+    from vanejax.machine.pose_file import PoseRecord
+    from vanejax.rigid import RigidTransform
+
+FORMATS = ("matrix", "kuka", "iso", "heidenhain", "siemens")
+COMPENSATION_FORMATS = ("matrix", "kuka")  # the others say work frames only
+_FRAME_HELP = "JSON, 16 numbers, or a frame of KUKA, ISO, Heidenhain or Siemens; mm, deg"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds what the command takes."""
+    parser.add_argument(
+        "pose", metavar="POSE", help="the pose: JSON from `vanejax register --json`"
+    )
+    parser.add_argument(
+        "--camera-pose",
+        metavar="FILE",
+        help="machine_from_camera, from the calibration of the sensor: "
+        f"{_FRAME_HELP}; without it the scan is taken to be in the machine's frame",
+    )
+    parser.add_argument(
+        "--nominal",
+        metavar="FILE",
+        help=f"machine_from_part as the program presumes it: {_FRAME_HELP}",
+    )
+    parser.add_argument(
+        "--format",
+        choices=(*FORMATS, "all"),
+        default="all",
+        help="for which controller (all)",
+    )
+    parser.add_argument(
+        "--accept-verdict",
+        choices=("accepted", "ambiguous", "rejected"),
+        default="accepted",
+        help="the worst verdict that is taken (accepted)",
+    )
+    parser.add_argument(
+        "--tool-path",
+        metavar="CSV",
+        help="points x,y,z[,i,j,k] in mm, with the tool's axis, to move to where the part is",
+    )
+    parser.add_argument(
+        "--path-frame",
+        choices=("part", "machine"),
+        default="part",
+        help="of --tool-path: the part's (default), or the machine's as the program has it",
+    )
+    parser.add_argument("--out", metavar="CSV", help="write the moved path here, machine frame")
+    parser.add_argument(
+        "--part",
+        dest="cad",
+        metavar="CAD",
+        help="the part: its size tells what rounding costs, its surface whether the path is on "
+        "it; or the word vane for the built-in guide vane",
+    )
+    workpiece.add_units(parser)
+    parser.add_argument(
+        "--tolerance-mm",
+        type=float,
+        default=0.05,
+        metavar="MM",
+        help="of the path from the part's surface (0.05)",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Prints the work frame and the compensation, and moves the path.
+
+    A pose that was not accepted is refused with the exit code of its verdict.
+
+    Raises:
+      InputError: an argument or a file that cannot be used.
+    """
+    _check(arguments)
+
+    from vanejax.machine.controllers import Compensation, read_frame
+    from vanejax.machine.pose_file import read_record
+
+    record = read_record(arguments.pose)
+    code = _refusal(record, arguments)
+    if code:
+        return code
+    notes = []
+    if record.verdict is None:
+        notes.append("the pose has no verdict: nobody checked it")
+    elif record.verdict.status != "accepted":
+        notes.append(f"the pose is {record.verdict.status}: {record.verdict.reason}")
+    machine_from_part = record.part_from_camera.inverse()
+    if arguments.camera_pose is None:
+        notes.append("the scan's frame is taken to be the machine's (no --camera-pose)")
+    else:
+        machine_from_camera = read_frame(arguments.camera_pose, target="machine", source="camera")
+        machine_from_part = machine_from_camera @ machine_from_part
+    compensation = None
+    if arguments.nominal is not None:
+        nominal = read_frame(arguments.nominal, target="machine", source="part")
+        compensation = Compensation(machine_from_part, nominal)
+    part = None
+    if arguments.cad is not None:
+        part = workpiece.load_workpiece(arguments, must_be_closed=False)
+        if record.part_sha256 not in (None, part.sha256):
+            raise InputError(
+                f"--part {arguments.cad}: is not the part of {arguments.pose} (another sha256); "
+                "give the CAD file that was registered"
+            )
+    lines = _work_frame(machine_from_part, arguments.format, part)
+    if compensation is not None:
+        lines += _compensation(compensation, arguments.format, part)
+    if arguments.tool_path is not None:
+        lines += _tool_path(arguments, machine_from_part, compensation, part)
+    print("\n".join(lines + [f"note: {note}" for note in notes]))
+    return 0
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Refuses, before any work, options that do not go together and outputs that cannot be."""
+    if (arguments.tool_path is None) != (arguments.out is None):
+        raise InputError("--tool-path and --out go together: what to move, and where to write it")
+    if arguments.path_frame == "machine" and arguments.nominal is None:
+        raise InputError(
+            "--path-frame machine needs --nominal: where the program presumes the part"
+        )
+    if not 0 < arguments.tolerance_mm < float("inf"):
+        raise InputError(f"--tolerance-mm {arguments.tolerance_mm}: should be more than 0")
+    if arguments.out is None:
+        return
+    from vanejax.files import check_writable
+
+    inputs = (
+        arguments.pose,
+        arguments.camera_pose,
+        arguments.nominal,
+        arguments.tool_path,
+        arguments.cad,
+    )
+    if os.path.realpath(arguments.out) in {os.path.realpath(path) for path in inputs if path}:
+        raise InputError(f"--out {arguments.out}: is an input already; choose another name")
+    check_writable(arguments.out)
+
+
+def _refusal(record: PoseRecord, arguments: argparse.Namespace) -> int:
+    """The exit code with which a pose is not taken, said on stderr; 0 where it is."""
+    order = list(EXIT_CODES)  # from the best to the worst
+    verdict = record.verdict
+    if verdict is None or order.index(verdict.status) <= order.index(arguments.accept_verdict):
+        return 0
+    print(
+        f"vanejax: refused: {arguments.pose} is {verdict.status}: {verdict.reason}; scan and "
+        "register again, or, where you know by other means that the pose is right, "
+        f"--accept-verdict {verdict.status}",
+        file=sys.stderr,
+    )
+    return EXIT_CODES[verdict.status]
+
+
+def _work_frame(machine_from_part: RigidTransform, chosen: str, part: Part | None) -> list[str]:
+    from vanejax.machine.frame_notation import NOTATIONS
+
+    lines = ["work frame: machine_from_part, where the part sits in the machine"]
+    for name in FORMATS if chosen == "all" else (chosen,):
+        notation = NOTATIONS[name]
+        lines += ["", f"{notation.title}: {notation.formula}"]
+        text = notation.write(machine_from_part)
+        lines += [f"  {line}" for line in text.splitlines()]
+        if part is not None:
+            lines.append(f"  rounding: at most {_rounding(name, machine_from_part, part):.1e} mm")
+    return lines
+
+
+def _rounding(name: str, machine_from_part: RigidTransform, part: Part) -> float:
+    """What reading the text again is off by on the part, mm."""
+    import numpy as np
+
+    from vanejax.machine.controllers import rounding_error_mm
+    from vanejax.machine.frame_notation import NOTATIONS
+
+    notation = NOTATIONS[name]
+    farthest = float(np.linalg.norm(part.mesh.vertices, axis=1).max())
+    written = notation.read(notation.write(machine_from_part))
+    return rounding_error_mm(written, machine_from_part, farthest)
+
+
+def _compensation(compensation: Compensation, chosen: str, part: Part | None) -> list[str]:
+    import numpy as np
+
+    from vanejax.machine.frame_notation import NOTATIONS
+
+    place = "origin" if part is None else "centre"
+    point = np.zeros((1, 3)) if part is None else part.center[None]
+    actual = compensation.machine_from_part.apply(point)[0]
+    nominal = compensation.nominal_machine_from_part.apply(point)[0]
+    lines = ["", "compensation: from where the program presumes the part to where it is"]
+    lines.append(
+        f"  the part's {place} is moved by {_vector(actual - nominal)} mm (machine x, y, z)"
+    )
+    for frame, motion in (
+        ("machine", compensation.in_machine),
+        ("part", compensation.in_part),
+    ):
+        lines.append(f"  {_turn(motion)} (in the {frame}'s frame)")
+    names = [n for n in COMPENSATION_FORMATS if chosen in (n, "all")] or ["matrix"]
+    for frame, motion, formula in (
+        ("machine", compensation.in_machine, "actual nominal^-1"),
+        ("part", compensation.in_part, "nominal^-1 actual"),
+    ):
+        lines += ["", f"compensation in the {frame}'s frame, {formula}:"]
+        for name in names:
+            lines += [f"  {line}" for line in NOTATIONS[name].write(motion).splitlines()]
+    return lines
+
+
+def _turn(motion: RigidTransform) -> str:
+    from vanejax.machine.controllers import axis_angle_deg
+
+    axis, angle = axis_angle_deg(motion.rotation)
+    x, y, z = (round(float(value), 3) + 0.0 for value in axis)
+    return f"turned by {angle:.4f} deg about ({x:+.3f}, {y:+.3f}, {z:+.3f})"
+
+
+def _vector(vector: np.ndarray) -> str:
+    return ", ".join(f"{round(float(value), 4) + 0.0:+.4f}" for value in vector)
+
+
+def _tool_path(
+    arguments: argparse.Namespace,
+    machine_from_part: RigidTransform,
+    compensation: Compensation | None,
+    part: Part | None,
+) -> list[str]:
+    """Moves the path, writes it, and says how it lies to the part where that is given."""
+    from vanejax.machine.controllers import Compensation
+    from vanejax.machine.tool_path import (
+        compensate,
+        read_tool_path,
+        tool_path_deviation,
+        write_tool_path,
+    )
+
+    path = read_tool_path(arguments.tool_path)
+    known = compensation or Compensation(machine_from_part, machine_from_part)
+    moved = compensate(path, known, frame=arguments.path_frame)
+    write_tool_path(arguments.out, moved)
+    axes = "" if path.axes is None else " with tool axes"
+    lines = ["", f"tool path: {len(path.points):,} points{axes}, machine frame: {arguments.out}"]
+    if part is None:
+        return lines
+    from vanejax.cad.nearest_face import NearestFace
+
+    surface = NearestFace(part)
+    programmed = path
+    if arguments.path_frame == "part":
+        programmed = path.moved(known.nominal_machine_from_part)
+    rows = [("compensated", moved)]
+    if compensation is not None:
+        rows.append(("as programmed", programmed))
+    for words, points in rows:
+        found = tool_path_deviation(
+            points.points, surface, machine_from_part, tolerance_mm=arguments.tolerance_mm
+        )
+        near = f"{found.share_within:.1%} within {arguments.tolerance_mm:g} mm"
+        lines.append(
+            f"  {words + ':':15}off the part as measured by {found.mean_mm:.4f} mm on average, "
+            f"{found.largest_mm:.4f} mm at most; {near}"
+        )
+    return lines

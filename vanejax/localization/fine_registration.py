@@ -1,0 +1,287 @@
+"""Fine registration: Gauss-Newton on what the CAD model predicts for every measured point.
+
+Two stages. `descend` is robust and cheap: a few thousand points, many poses at once, a kernel that
+narrows with the residuals; it has a wide basin. `refine` then takes every point and weighs it by
+the noise that the residuals themselves show (`noise`), down to the limit that this noise sets.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vanejax.errors import InputError
+from vanejax.localization.covariance import inflation, patches_of
+from vanejax.localization.noise import LEAST_COSINE, Noise, fit_noise, weights
+from vanejax.localization.pose_result import Refinement
+from vanejax.localization.residuals import MeasurementModel, Precision, RayCasting, Residuals, moved
+from vanejax.rigid import RigidTransform
+
+COARSE_POINTS = 4_000
+MEDIUM_POINTS = 20_000
+MOST_POINTS = 400_000  # more of them improve the pose by less than the casting's own tolerance
+# of the part's radius: no sensor worth the name is noisier, and no kernel starts narrower
+SCALE_FLOOR = 0.01
+NOISE_FITS = 4  # of the last stage's iterations
+SETTLED = 0.1  # of a standard deviation of the pose: a smaller step says nothing new
+
+
+def subset(points: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Indices of at most ``count`` points, drawn without replacement, ascending."""
+    if len(points) <= count:
+        return np.arange(len(points))
+    return np.sort(np.random.default_rng(seed).choice(len(points), count, replace=False))
+
+
+def descend(
+    model: MeasurementModel,
+    part_from_camera: RigidTransform,
+    points: np.ndarray,
+    *,
+    iterations: int,
+    feet: Precision = "grid",
+    floor_mm: float | None = None,
+    settled_deg: float = 0.0,
+) -> tuple[RigidTransform, int]:
+    """Robust Gauss-Newton from a batch of poses, on the same points for all of them.
+
+    Deviations are taken along the surface normal (bounded at grazing incidence, where those along
+    the ray are not), with a Geman-McClure kernel as wide as two robust standard deviations. Points
+    whose ray misses pull towards the nearest surface. Steps are limited to 20 deg and a fifth of
+    the part's radius.
+
+    Args:
+      model: predicts points.
+      part_from_camera: H poses, [H, 3, 3] and [H, 3].
+      points: [n, 3] mm, camera frame.
+      iterations: at most.
+      feet: as in `MeasurementModel.residuals`.
+      floor_mm: the kernel's scale is no smaller; default 1 % of the part's radius.
+      settled_deg: a pose that turns by less, and moves by less of the part's radius, is left.
+
+    Returns:
+      H poses, and the number of iterations done.
+    """
+    radius = model.part.radius
+    floor = SCALE_FLOOR * radius if floor_mm is None else floor_mm
+    damping = 1e-3 * np.diag([radius**2] * 3 + [1.0] * 3)
+    rotation, translation = part_from_camera.rotation.copy(), part_from_camera.translation.copy()
+    moving = np.arange(len(rotation))
+    done = 0
+    while done < iterations and len(moving):
+        done += 1
+        poses = RigidTransform(rotation[moving], translation[moving])
+        now = model.residuals(poses, points, feet=feet)
+        deviation = now.deviation_mm
+        scale = 1.4826 * np.median(np.abs(deviation), axis=1)
+        scale = 2 * np.clip(scale, floor, 0.3 * radius)[:, None]
+        weight = 1 / (1 + (deviation / scale) ** 2) ** 2
+        weighted = now.jacobian * weight[..., None]
+        information = weighted.swapaxes(-1, -2) @ now.jacobian
+        gradient = np.einsum("hnk,hn->hk", weighted, deviation)
+        information += damping * weight.sum(axis=1)[:, None, None]
+        delta = -np.linalg.solve(information, gradient[..., None])[..., 0]
+        turn = np.linalg.norm(delta[:, :3], axis=1)
+        shift = np.linalg.norm(delta[:, 3:], axis=1) / radius
+        delta /= np.maximum(1, np.maximum(turn / np.radians(20), shift / 0.2))[:, None]
+        poses = moved(model.part, poses, delta)
+        rotation[moving], translation[moving] = poses.rotation, poses.translation
+        moving = moving[np.degrees(np.maximum(turn, shift)) >= settled_deg]
+    return RigidTransform(rotation, translation), done
+
+
+def refine(
+    model: MeasurementModel,
+    points: np.ndarray,
+    init: RigidTransform,
+    *,
+    max_iterations: int = 12,
+    seed: int = 0,
+    max_allowance_mm: float = 0.0,
+) -> Refinement:
+    """One pose to the limit of what the scan's noise lets one know.
+
+    A casting has stock all over that its CAD model lacks: least squares then moves the part towards
+    the sensor. With ``max_allowance_mm`` a uniform offset along the outward normals is estimated as
+    a seventh unknown, and the pose's information is what is left when the offset is not known
+    (the Schur complement).
+
+    Args:
+      model: predicts points.
+      points: [N, 3] f64, mm, camera frame.
+      init: rough part_from_camera, [3, 3] and [3]; 5 deg and 5 mm off are no trouble.
+      max_iterations: of the last stage.
+      seed: of the random subsets of points in the first stages.
+      max_allowance_mm: how large that offset may be; 0 for a part that is its CAD model. It is a
+        weak prior, normal with half of this as its deviation: only where the scan cannot tell
+        the offset from a motion, as on a single plane, does it count, and takes it for a motion.
+
+    Raises:
+      InputError: a negative or infinite ``max_allowance_mm``.
+    """
+    check_allowance(max_allowance_mm)
+    batch = RigidTransform(init.rotation[None], init.translation[None])
+    coarse = points[subset(points, COARSE_POINTS, seed)]
+    batch, iterations = descend(model, batch, coarse, iterations=25, settled_deg=0.02)
+    # what a narrow-band sensor needs and a noisy one does not mind: the kernel at the noise itself
+    batch, more = descend(
+        model,
+        batch,
+        coarse,
+        iterations=10,
+        feet="samples",
+        floor_mm=1e-4 * model.part.radius,
+        settled_deg=0.002,
+    )
+    iterations += more
+    allowance = 0.0
+    # stock moves the part until it is known: the weights of a pose that far off are no use later
+    passes = 2 if max_allowance_mm else int(len(points) > 2 * MEDIUM_POINTS)
+    for _ in range(passes):
+        medium = points[subset(points, MEDIUM_POINTS, seed)]
+        polished = _polish(model, medium, batch, max_iterations, allowance, max_allowance_mm)
+        batch, iterations = polished.part_from_camera, iterations + polished.iterations
+        allowance = polished.allowance_mm
+    points = points[subset(points, MOST_POINTS, seed)]
+    polished = _polish(model, points, batch, max_iterations, allowance, max_allowance_mm)
+    return Refinement(
+        part_from_camera=RigidTransform(
+            polished.part_from_camera.rotation[0], polished.part_from_camera.translation[0]
+        ),
+        converged=polished.converged,
+        iterations=iterations + polished.iterations,
+        method="ray casting" if isinstance(model, RayCasting) else "point to plane",
+        noise_mm=float(polished.noise.range_mm),
+        num_points=len(points),
+        num_inliers=polished.num_inliers,
+        information=polished.information,
+        allowance_mm=polished.allowance_mm,
+        allowance_sigma_mm=polished.allowance_sigma_mm,
+    )
+
+
+def check_allowance(max_allowance_mm: float) -> None:
+    """Raises InputError for a length that stock cannot have."""
+    if not 0 <= max_allowance_mm < np.inf:
+        raise InputError(
+            f"max_allowance_mm must be 0 mm or more and finite, got {max_allowance_mm!r}; "
+            "1 mm is usual for an investment casting"
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Polished:
+    """The end of `_polish`; the pose has a leading axis of 1."""
+
+    part_from_camera: RigidTransform
+    converged: bool
+    iterations: int
+    noise: Noise
+    num_inliers: int
+    information: np.ndarray
+    allowance_mm: float
+    allowance_sigma_mm: float
+
+
+def _polish(
+    model: MeasurementModel,
+    points: np.ndarray,
+    batch: RigidTransform,
+    max_iterations: int,
+    allowance: float,
+    max_allowance_mm: float,
+) -> _Polished:
+    """Least squares along the rays, weighted by the noise that is fitted on the way."""
+    patches = patches_of(model, points)
+    converged = False
+    weight = np.full(len(points), np.inf)
+    bare = points
+    if allowance:
+        pose = RigidTransform(batch.rotation[0], batch.translation[0])
+        bare = without_stock(model, points, pose, allowance)
+    for step in range(max_iterations):
+        now = model.residuals(batch, bare)
+        columns = now.jacobian[0]
+        if max_allowance_mm:
+            columns = np.column_stack([columns, np.ones(len(points))])
+        cosine = np.maximum(now.cosine[0], LEAST_COSINE)
+        along = now.deviation_mm[0] / cosine
+        if step < NOISE_FITS:  # then fixed: pose and noise would follow each other round
+            noise = fit_noise(now)
+        fresh = weights(along, cosine, noise)
+        # a ray that was off once stays out: else those at edges would come and go for ever
+        weight = fresh if step < NOISE_FITS else np.minimum(weight, fresh)
+        weighted = columns * (weight / cosine)[:, None]
+        scores = weighted * along[:, None]
+        information = weighted.T @ (columns / cosine[:, None])
+        gradient = scores.sum(axis=0)
+        if max_allowance_mm:
+            prior = (2 / max_allowance_mm) ** 2
+            information[6, 6] += prior
+            gradient[6] -= prior * allowance
+        delta, known = _solve(information, gradient, model.part.radius)
+        information /= inflation(information, scores - scores.mean(axis=0), patches)
+        batch = moved(model.part, batch, -delta[None, :6])
+        if max_allowance_mm:
+            allowance += float(delta[6])
+            bare = _bare(points, allowance, now, batch)
+        if delta @ information @ delta < SETTLED**2 * len(delta):
+            converged = bool(known)
+            break
+    pose_information, allowance_sigma = _without_allowance(information)
+    return _Polished(
+        part_from_camera=batch,
+        converged=converged,
+        iterations=step + 1,
+        noise=noise,
+        num_inliers=int(np.count_nonzero(weight)),
+        information=pose_information,
+        allowance_mm=allowance,
+        allowance_sigma_mm=allowance_sigma,
+    )
+
+
+def without_stock(
+    model: MeasurementModel, points: np.ndarray, part_from_camera: RigidTransform, allowance: float
+) -> np.ndarray:
+    """Points [n, 3] mm, camera frame, moved inward by ``allowance`` mm along the normals at a pose.
+
+    Those of the faces that the model predicts for them under ``part_from_camera``, one pose.
+    """
+    batch = RigidTransform(part_from_camera.rotation[None], part_from_camera.translation[None])
+    return _bare(points, allowance, model.residuals(batch, points), batch)
+
+
+def _bare(
+    points: np.ndarray, allowance: float, now: Residuals, part_from_camera: RigidTransform
+) -> np.ndarray:
+    """Points [n, 3], camera frame, as if the stock were taken off along the faces' normals.
+
+    To take it from the deviations would be wrong by more than the noise: where the surface is
+    curved, a ray meets the CAD model elsewhere than under the stock that it ends at.
+    """
+    normals = now.jacobian[0][:, 3:] @ part_from_camera.rotation[0]
+    return points - allowance * normals
+
+
+def _without_allowance(information: np.ndarray) -> tuple[np.ndarray, float]:
+    """[6, 6] of the pose alone where the offset is not known, and the offset's deviation in mm."""
+    if len(information) == 6:
+        return information, 0.0
+    pose, both, offset = information[:6, :6], information[:6, 6], information[6, 6]
+    left = offset - both @ np.linalg.pinv(pose, hermitian=True) @ both
+    return pose - np.outer(both, both) / offset, float(1 / np.sqrt(max(left, 1e-12)))
+
+
+def _solve(information: np.ndarray, gradient: np.ndarray, radius: float) -> tuple[np.ndarray, bool]:
+    """The Gauss-Newton step, and whether all its directions are known.
+
+    Directions in which the scan knows a million times less than in the best one stay as they are.
+    """
+    unit = np.array([1 / radius] * 3 + [1.0] * (len(gradient) - 3))
+    values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
+    known = values > 1e-8 * max(values[-1], 1e-30)
+    along = vectors.T @ (gradient * unit)
+    step = vectors @ np.where(known, along / np.where(known, values, 1.0), 0.0)
+    return step * unit, bool(known.all())

@@ -1,0 +1,186 @@
+"""What registering one scan to one part gives: a pose, how sure it is, and whether to trust it.
+
+Frames. ``camera`` is the frame of the scan's file, whatever sensor wrote it; ``part`` is that of
+the CAD model. Everything is float64, millimetres and, where a name ends in ``_deg``, degrees.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+from vanejax.rigid import RigidTransform
+
+Status = Literal["accepted", "ambiguous", "rejected"]
+
+
+class PointStatus(enum.IntEnum):
+    """What a measured point says about a pose.
+
+    INLIER: it lies on the part, within what the noise explains.
+    BEFORE: the ray should have gone on to the part: dust, a fixture, or a wrong pose.
+    BEHIND: the ray went through material: no sensor sees that, a free-space violation.
+    BESIDE: the ray, or where the sensor is unknown the point, does not meet the part at all.
+    """
+
+    INLIER = 0
+    BEFORE = 1
+    BEHIND = 2
+    BESIDE = 3
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """How far the pose may be off, if the noise is white and the CAD model is the part.
+
+    The error is a small motion in the part's frame about the part's centre c: the true
+    ``part_from_camera`` maps to ``c + exp(e[:3]) (x - c) + e[3:]`` what the reported one maps to x.
+    Left out: errors of the sensor's calibration and of the casting itself, which no noise shows.
+
+    Attributes:
+      covariance: [6, 6], of e = (rotation vector in rad, translation in mm).
+      center: [3] mm, c.
+      rotation_sigma_deg: [3], about the part's x, y, z.
+      translation_sigma_mm: [3], along the part's x, y, z, at its centre.
+      weakest_rotation_axis: [3] unit, the axis about which the rotation is least certain.
+      weakest_rotation_sigma_deg: about that axis.
+      weakest_translation_axis: [3] unit, the direction in which the translation is least certain.
+      weakest_translation_sigma_mm: along it.
+    """
+
+    covariance: np.ndarray
+    center: np.ndarray
+    rotation_sigma_deg: np.ndarray
+    translation_sigma_mm: np.ndarray
+    weakest_rotation_axis: np.ndarray
+    weakest_rotation_sigma_deg: float
+    weakest_translation_axis: np.ndarray
+    weakest_translation_sigma_mm: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Refinement:
+    """How a fine registration ended.
+
+    Attributes:
+      part_from_camera: the refined pose.
+      converged: whether the last step was below what the noise lets one know.
+      iterations: Gauss-Newton steps, all stages together.
+      method: ``"ray casting"``, or ``"point to plane"`` where the sensor's place is unknown.
+      noise_mm: robust standard deviation of the residuals of the inliers, along the ray (ray
+        casting) or along the surface normal (point to plane).
+      num_points: points used in the last step.
+      num_inliers: of them, those with a weight.
+      information: [6, 6], J^T W J of the last step: the inverse of `Uncertainty.covariance`, in
+        the same coordinates.
+      allowance_mm: the uniform offset of the surface along its outward normals, where one was
+        estimated: a casting's stock; else 0.
+      allowance_sigma_mm: its standard deviation, the pose not being known either; else 0.
+    """
+
+    part_from_camera: RigidTransform
+    converged: bool
+    iterations: int
+    method: str
+    noise_mm: float
+    num_points: int
+    num_inliers: int
+    information: np.ndarray
+    allowance_mm: float = 0.0
+    allowance_sigma_mm: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Verification:
+    """What the scan says about a pose.
+
+    Attributes:
+      inlier_share: of the points that were checked, 0 to 1.
+      violation_share: points of status BEHIND, 0 to 1; NaN where the sensor's place is unknown.
+      unmeasured_share: of the part's surface that the sensor should have seen, what has no
+        measurement, 0 to 1; NaN where the sensor's place is unknown.
+      tolerance_mm: the largest deviation of an inlier.
+      checked: [n] i64, which points of the scan were checked.
+      status: [n] u8, their `PointStatus`.
+      deviation_mm: [n], signed distance to the CAD surface along its normal, positive outside the
+        material; NaN where a point has no partner on the part.
+      score: one figure to compare poses of the same scan, larger is better.
+    """
+
+    inlier_share: float
+    violation_share: float
+    unmeasured_share: float
+    tolerance_mm: float
+    checked: np.ndarray
+    status: np.ndarray
+    deviation_mm: np.ndarray
+    score: float
+
+    @property
+    def support(self) -> float:
+        """What agrees on both sides: share of the points times share of the surface, 0 to 1."""
+        unmeasured = 0.0 if np.isnan(self.unmeasured_share) else self.unmeasured_share
+        return self.inlier_share * (1 - unmeasured)
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """Whether to trust the pose, and the sentence that says why."""
+
+    status: Status
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Alternative:
+    """Another pose that the scan does not rule out.
+
+    Attributes:
+      part_from_camera: that pose.
+      rotation_deg: how far it is turned from the reported pose.
+      translation_mm: how far the part's centre is moved from the reported pose.
+      inlier_share: as in `Verification`.
+    """
+
+    part_from_camera: RigidTransform
+    rotation_deg: float
+    translation_mm: float
+    inlier_share: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PoseResult:
+    """The answer of `vanejax.register`.
+
+    Attributes:
+      part_from_camera: the pose: maps points of the scan's frame to the part's frame.
+      verdict: accepted, ambiguous or rejected, and why.
+      refinement: how the fine registration ended.
+      uncertainty: covariance and its weakest directions.
+      verification: what every checked point says.
+      alternatives: other poses that the scan allows, best first; empty unless ambiguous.
+      before: the pose before the fine registration (the guess given, or the best hypothesis).
+      sensor_origin: [3] mm, scan frame; None where unknown.
+      notes: what was assumed, dropped or repaired, a sentence each.
+      seconds: wall time of each stage by name, in order.
+    """
+
+    part_from_camera: RigidTransform
+    verdict: Verdict
+    refinement: Refinement
+    uncertainty: Uncertainty
+    verification: Verification
+    alternatives: tuple[Alternative, ...]
+    before: RigidTransform
+    sensor_origin: np.ndarray | None
+    notes: tuple[str, ...]
+    seconds: Mapping[str, float]
+
+    @property
+    def camera_from_part(self) -> RigidTransform:
+        """The inverse: where the part is in the scan's frame."""
+        return self.part_from_camera.inverse()

@@ -1,0 +1,257 @@
+"""Where the camera stands in the frame of a measuring machine, from a cube that both measured.
+
+Section IV.B.2 of the paper: three faces of a cube, square to each other, are scanned by the camera
+and touched by the machine's probe, at several placements. The paper registers the three faces of
+each placement and puts the eight matrices together: `averaged`. `calibrate` asks for the one
+motion that brings all planes of all placements onto each other, each weighted by how well it is
+known. It does not need the cube to be square, since both see the same three planes.
+
+Host code, float64, mm.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vanejax.errors import InputError
+from vanejax.machine.calibration_cube import SIDE_MM, Cube, Face
+from vanejax.rigid import RigidTransform
+
+MOST_MISMATCH_MM = 2.0  # of corresponding cubes: more is another cube, or labels mixed up
+CLEARER = 3.0  # how much better the right labels must fit than others
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Calibration:
+    """Where the camera is, and how well that is known.
+
+    Attributes:
+      machine_from_camera: T_b of eq. 13.
+      covariance: [6, 6] of its error, a small motion in the machine's frame about ``center``
+        applied after it, see `vanejax.machine.positioning`; (rad, mm).
+      center: [3] mm, machine frame: the middle of the cubes' corners.
+      rotation_deg: [P], of each placement's cube frame, left over.
+      corner_mm: [P], of its corner.
+      misfit: root of chi square per degree of freedom: 1 where the cubes fit as well as their
+        noise lets them. Above it the covariance has been enlarged by its square. NaN from
+        `averaged`, which knows no noise.
+    """
+
+    machine_from_camera: RigidTransform
+    covariance: np.ndarray
+    center: np.ndarray
+    rotation_deg: np.ndarray
+    corner_mm: np.ndarray
+    misfit: float
+
+    @property
+    def rotation_sigma_deg(self) -> float:
+        """Root of the sum over three axes."""
+        return float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
+
+    @property
+    def translation_sigma_mm(self) -> float:
+        """The same, at ``center``."""
+        return float(np.sqrt(np.trace(self.covariance[3:, 3:])))
+
+
+def calibrate(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> Calibration:
+    """machine_from_camera from P placements of a cube: one least squares over all their planes.
+
+    Each face gives three residuals: two tilts of its normal, and the distance of the machine's
+    plane from the camera's where the probe touched it. They are weighted by the inverse of their
+    covariance, both sides' together. Which face is which need not be said where there are two
+    placements or more, see `matched`.
+
+    Raises:
+      InputError: no cubes, or cubes that do not match.
+    """
+    camera_cubes = matched(camera_cubes, machine_cubes)
+    machine_from_camera, center = _aligned(camera_cubes, machine_cubes)
+    for _ in range(20):
+        information, gradient, chi = np.zeros((6, 6)), np.zeros(6), 0.0
+        for seen, touched in zip(camera_cubes, machine_cubes, strict=True):
+            for one, other in zip(
+                seen.moved(machine_from_camera).faces, touched.faces, strict=True
+            ):
+                residual, jacobian, covariance = _disagreement(one, other, center)
+                weighted = np.linalg.solve(covariance, np.column_stack([jacobian, residual]))
+                information += jacobian.T @ weighted[:, :6]
+                gradient += jacobian.T @ weighted[:, 6]
+                chi += float(residual @ weighted[:, 6])
+        step = -np.linalg.solve(information, gradient)
+        machine_from_camera = _nudged(machine_from_camera, step, center)
+        if step @ information @ step < 1e-12:
+            break
+    free = 9 * len(camera_cubes) - 6
+    misfit = float(np.sqrt(chi / free))
+    return _judged(
+        machine_from_camera,
+        np.linalg.inv(information) * max(1.0, misfit**2),
+        center,
+        camera_cubes,
+        machine_cubes,
+        misfit,
+    )
+
+
+def averaged(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> Calibration:
+    """machine_from_camera as the paper has it: the mean of one matrix for each placement.
+
+    The rotation is the chordal mean (Hartley et al. 2013); Euler angles, which the paper averages,
+    have no mean near their poles. The translation then brings the corners onto each other, rather
+    than being the mean of eight, each of which carries its own rotation's error over 400 mm. The
+    covariance is that of a mean of P alike: it is NaN for one placement.
+
+    Raises:
+      InputError: no cubes, or cubes that do not match.
+    """
+    camera_cubes = matched(camera_cubes, machine_cubes)
+    frames = [
+        (touched.world_from_cube, seen.world_from_cube)
+        for seen, touched in zip(camera_cubes, machine_cubes, strict=True)
+    ]
+    turns = Rotation.from_matrix([b.rotation @ a.rotation.T for b, a in frames])
+    rotation = turns.mean().as_matrix()
+    shifts = np.stack([b.translation - rotation @ a.translation for b, a in frames])
+    center = np.mean([b.translation for b, _ in frames], axis=0)
+    errors = np.concatenate(
+        [
+            (turns * Rotation.from_matrix(rotation).inv()).as_rotvec(),
+            shifts - shifts.mean(axis=0),
+        ],
+        axis=1,
+    )
+    count = len(frames)
+    spread = errors.T @ errors / (count * (count - 1)) if count > 1 else np.full((6, 6), np.nan)
+    return _judged(
+        RigidTransform(rotation, shifts.mean(axis=0)),
+        spread,
+        center,
+        camera_cubes,
+        machine_cubes,
+        float("nan"),
+    )
+
+
+def matched(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> list[Cube]:
+    """The camera's cubes with their faces named as the machine's.
+
+    A cube looks the same in three attitudes. Placed twice at different tilts, or at different
+    places, only one way of naming its faces lets one motion fit all. A single placement is taken as
+    it is given.
+
+    Raises:
+      InputError: no cubes, not as many of each, or no way to name the faces that fits better than
+        all others and to 2 mm.
+    """
+    if not camera_cubes or len(camera_cubes) != len(machine_cubes):
+        raise InputError(
+            f"a calibration needs the same placements from both, at least one; got "
+            f"{len(camera_cubes)} cubes of the camera and {len(machine_cubes)} of the machine"
+        )
+    tried = []
+    for first in range(3 if len(camera_cubes) > 1 else 1):
+        rough = _aligned([camera_cubes[0].relabelled(first)], machine_cubes[:1])[0]
+        named = [camera_cubes[0].relabelled(first)]
+        for seen, touched in zip(camera_cubes[1:], machine_cubes[1:], strict=True):
+            ways = [seen.relabelled(shift) for shift in range(3)]
+            turns = [rough.rotation @ way.world_from_cube.rotation for way in ways]
+            like = [np.trace(touched.world_from_cube.rotation.T @ turn) for turn in turns]
+            named.append(ways[int(np.argmax(like))])
+        both = _aligned(named, machine_cubes)[0]
+        off = [
+            both.apply(_corners(seen)) - _corners(touched)
+            for seen, touched in zip(named, machine_cubes, strict=True)
+        ]
+        tried.append((float(np.sqrt(3 * np.mean(np.square(off)))), first, named))
+    tried.sort(key=lambda found: found[:2])
+    best = tried[0]
+    if best[0] > MOST_MISMATCH_MM:
+        raise InputError(
+            f"the camera's cubes and the machine's do not match: their corners stay {best[0]:.2g} "
+            "mm apart; is the order of the placements the same, and are the points of each face "
+            "on that face?"
+        )
+    if len(tried) > 1 and tried[1][0] < CLEARER * max(best[0], 0.05):
+        raise InputError(
+            f"which face of the cube is which cannot be told: two ways fit to {best[0]:.2g} and "
+            f"{tried[1][0]:.2g} mm; turn the cube between the placements"
+        )
+    return best[2]
+
+
+def _corners(cube: Cube) -> np.ndarray:
+    """[4, 3] mm: the corner and the next three of the cube's ideal shape."""
+    offsets = -SIDE_MM * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    return cube.world_from_cube.apply(offsets)
+
+
+def _aligned(
+    camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]
+) -> tuple[RigidTransform, np.ndarray]:
+    """The motion that brings the cubes' corners together, and the middle [3] of the machine's."""
+    seen = np.concatenate([_corners(cube) for cube in camera_cubes])
+    touched = np.concatenate([_corners(cube) for cube in machine_cubes])
+    start, end = seen.mean(axis=0), touched.mean(axis=0)
+    rotation = Rotation.align_vectors(touched - end, seen - start)[0].as_matrix()
+    center = np.mean([cube.corner for cube in machine_cubes], axis=0)
+    return RigidTransform(rotation, end - rotation @ start), center
+
+
+def _disagreement(
+    seen: Face, touched: Face, center: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Residual [3], its derivative [3, 6] by a small motion of ``seen`` about ``center``, and its
+    covariance [3, 3]; both faces in the machine's frame.
+
+    Tilts ``U^T (n_b - n)`` in the touched plane's own axes U, then ``n . (x_b - x)`` at the middle
+    x_b of the touched points.
+    """
+    normal, away = seen.normal, touched.center - seen.center
+    axes = np.linalg.svd(touched.normal[None])[2][1:]  # [2, 3], U^T
+    residual = np.append(axes @ (touched.normal - normal), normal @ away)
+    jacobian = np.zeros((3, 6))
+    # the normal turns by w x n: a row u of U^T sees -u . (w x n) = -(n x u) . w
+    jacobian[:2, :3] = -np.cross(normal, axes)
+    jacobian[2, :3] = np.cross(normal, touched.center - center)
+    jacobian[2, 3:] = -normal
+    tilt = seen.normal_covariance
+    covariance = np.empty((3, 3))
+    covariance[:2, :2] = axes @ (tilt + touched.normal_covariance) @ axes.T
+    covariance[:2, 2] = covariance[2, :2] = -axes @ tilt @ away
+    covariance[2, 2] = seen.offset_variance + touched.offset_variance + away @ tilt @ away
+    # planes without noise would weigh without bounds
+    return residual, jacobian, covariance + np.diag([1e-14, 1e-14, 1e-10])
+
+
+def _nudged(pose: RigidTransform, step: np.ndarray, center: np.ndarray) -> RigidTransform:
+    """The pose with a small motion [6] about ``center`` after it."""
+    turn = Rotation.from_rotvec(step[:3]).as_matrix()
+    return RigidTransform(
+        turn @ pose.rotation, turn @ (pose.translation - center) + center + step[3:]
+    )
+
+
+def _judged(
+    machine_from_camera: RigidTransform,
+    covariance: np.ndarray,
+    center: np.ndarray,
+    camera_cubes: Sequence[Cube],
+    machine_cubes: Sequence[Cube],
+    misfit: float,
+) -> Calibration:
+    """With what is left over at each placement."""
+    turn_deg, corner_mm = [], []
+    for seen, touched in zip(camera_cubes, machine_cubes, strict=True):
+        one, other = machine_from_camera @ seen.world_from_cube, touched.world_from_cube
+        left = Rotation.from_matrix(other.rotation @ one.rotation.T)
+        turn_deg.append(float(np.degrees(left.magnitude())))
+        corner_mm.append(float(np.linalg.norm(other.translation - one.translation)))
+    return Calibration(
+        machine_from_camera, covariance, center, np.array(turn_deg), np.array(corner_mm), misfit
+    )

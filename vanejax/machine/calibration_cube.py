@@ -1,0 +1,268 @@
+"""A calibration cube: planes through the points of its faces, and the frame that three of them fix.
+
+A face's plane holds the points x with ``n . (x - center) = 0``. The frame is whatever the points
+are in. Host code, float64, mm.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vanejax.errors import InputError
+from vanejax.rigid import RigidTransform
+
+SIDE_MM = 60.0  # the paper's cube
+FORM_MM = 0.02 / np.sqrt(12)  # deviation of a face that is anywhere within its flatness of 0.02 mm
+FORM_PATCHES = 9  # of a face, over which errors of form are alike
+MOST_ASKEW_DEG = 1.0  # of square; the paper's cube is square to 0.02 deg
+REACH_MM = 0.4  # of a plane: what points on it may deviate, noise of a good camera and all
+EDGE_MM = 1.5  # nearer to another face a pixel may have mixed both
+TRIPLETS, TRIPLET_POINTS = 400, 3_000
+LEAST_SHARE = 0.02  # of the scan, the smallest face
+_LINE = 1e-3
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Face:
+    """A plane that was fitted to points.
+
+    Attributes:
+      normal: [3] unit.
+      center: [3] mm, mean of the points.
+      normal_covariance: [3, 3] rad^2, rank 2: the normal's error is square to it.
+      offset_variance: mm^2, of the plane along its normal at the centre; not correlated with the
+        normal's error there.
+      rms_mm: of the points from the plane.
+      count: of the points.
+    """
+
+    normal: np.ndarray
+    center: np.ndarray
+    normal_covariance: np.ndarray
+    offset_variance: float
+    rms_mm: float
+    count: int
+
+    def height_mm(self, points: np.ndarray) -> np.ndarray:
+        """[N] of points [N, 3] above the plane."""
+        return (points - self.center) @ self.normal
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Cube:
+    """Three faces of a cube, outward and right-handed: ``n0 x n1`` is along n2.
+
+    Attributes:
+      faces: the three.
+    """
+
+    faces: tuple[Face, Face, Face]
+
+    @property
+    def corner(self) -> np.ndarray:
+        """[3] mm: where the three planes meet."""
+        normals = np.stack([face.normal for face in self.faces])
+        return np.linalg.solve(normals, [face.normal @ face.center for face in self.faces])
+
+    @property
+    def world_from_cube(self) -> RigidTransform:
+        """The cube's frame: origin at the corner, axes nearest to the three normals.
+
+        Nearest in the sum of squares, all three alike: no face is the first.
+        """
+        normals = np.stack([face.normal for face in self.faces])
+        axes = Rotation.align_vectors(normals, np.eye(3))[0].as_matrix()
+        return RigidTransform(axes, self.corner)
+
+    def relabelled(self, shift: int) -> Cube:
+        """The same cube, its faces named in turn: 0, 1 and 2 of the three ways to do so."""
+        return Cube(tuple(self.faces[(k + shift) % 3] for k in range(3)))
+
+    def moved(self, target_from_this: RigidTransform) -> Cube:
+        """The same in another frame."""
+        turn = target_from_this.rotation
+        return Cube(
+            tuple(
+                dataclasses.replace(
+                    face,
+                    normal=turn @ face.normal,
+                    center=turn @ face.center + target_from_this.translation,
+                    normal_covariance=turn @ face.normal_covariance @ turn.T,
+                )
+                for face in self.faces
+            )
+        )
+
+
+def fit_face(points: np.ndarray, *, noise_mm: float = 0.0, form_mm: float = 0.0) -> Face:
+    """The plane of least squared distances to points [N, 3]; outliers of many are left out.
+
+    Args:
+      points: at least 3, not on one line.
+      noise_mm: of each point, along the normal, at least; three points show none of their own.
+      form_mm: deviation of the surface from a plane. It does not average out over the points: it
+        counts as the same over a ninth of the face.
+
+    Raises:
+      InputError: points that fix no plane.
+    """
+    points = np.asarray(points, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3:
+        raise InputError(f"a plane needs at least 3 points [N, 3] in mm, got {list(points.shape)}")
+    if not np.isfinite(points).all():
+        raise InputError("a plane needs finite points, in mm")
+    weight = np.ones(len(points))
+    for _ in range(10 if len(points) >= 20 else 1):
+        center = weight @ points / weight.sum()
+        around = points - center
+        values, axes = np.linalg.eigh(around.T @ (around * weight[:, None]))
+        height = around @ axes[:, 0]
+        before, sigma = weight, max(1.4826 * float(np.median(np.abs(height))), 1e-9)
+        # Tukey's biweight: strays of a scan lie 20 mm off
+        weight = np.maximum(1 - (height / (4.685 * sigma)) ** 2, 0) ** 2
+        if len(points) < 20 or np.abs(weight - before).max() < 1e-3:
+            weight = before
+            break
+    if values[1] < _LINE**2 * values[2] or values[2] <= 0:
+        raise InputError(f"{len(points)} points on one line fix no plane; touch the face at others")
+    count = float(weight.sum())
+    rms = float(np.sqrt(max(weight @ height**2, 0.0) / count))
+    # three of the points' freedoms are the plane's
+    own = rms * np.sqrt(count / (count - 3)) if count > 3.5 else 0.0
+    each = max(own, noise_mm) ** 2 / count + form_mm**2 / min(count, FORM_PATCHES)
+    tilts = axes[:, 1:] * np.sqrt(each * count / values[1:])
+    return Face(axes[:, 0], center, tilts @ tilts.T, each, rms, len(points))
+
+
+def cube_of(
+    points: Sequence[np.ndarray],
+    *,
+    noise_mm: float = 0.0,
+    form_mm: float = FORM_MM,
+    most_askew_deg: float = MOST_ASKEW_DEG,
+) -> Cube:
+    """A cube from points [N, 3] on each of three faces that meet, in any order.
+
+    Args:
+      points: three arrays, at least 3 points in each.
+      noise_mm, form_mm: see `fit_face`.
+      most_askew_deg: how far from square the faces may be.
+
+    Raises:
+      InputError: not three planes, or not square to each other.
+    """
+    if len(points) != 3:
+        raise InputError(f"a cube's frame needs three of its faces, got {len(points)}")
+    faces = [fit_face(some, noise_mm=noise_mm, form_mm=form_mm) for some in points]
+    for (i, one), (j, other) in itertools.combinations(enumerate(faces), 2):
+        askew = abs(float(np.degrees(np.arcsin(np.clip(one.normal @ other.normal, -1, 1)))))
+        if askew > most_askew_deg:
+            raise InputError(
+                f"faces {i} and {j} are {askew:.2f} deg from square, more than "
+                f"{most_askew_deg:g}: are their points on one face each, and is it a cube?"
+            )
+    outward = []
+    for k, face in enumerate(faces):
+        # the other faces lie below it: a cube is convex
+        below = sum(face.height_mm(other.center[None])[0] for other in faces)
+        normal = face.normal if below < 0 else -face.normal
+        outward.append(dataclasses.replace(faces[k], normal=normal))
+    if np.linalg.det(np.stack([face.normal for face in outward])) < 0:
+        outward[1], outward[2] = outward[2], outward[1]
+    return Cube(tuple(outward))
+
+
+def find_cube(
+    points: np.ndarray,
+    *,
+    side_mm: float = SIDE_MM,
+    noise_mm: float = 0.0,
+    form_mm: float = FORM_MM,
+    most_askew_deg: float = MOST_ASKEW_DEG,
+    reach_mm: float = REACH_MM,
+    seed: int = 0,
+) -> Cube:
+    """The cube in a scan of it alone that shows three of its faces.
+
+    See `cube_faces` for how the points are told apart, `cube_of` for the rest.
+
+    Raises:
+      InputError: no three faces, or not square.
+    """
+    labels = cube_faces(points, side_mm=side_mm, reach_mm=reach_mm, seed=seed)
+    return cube_of(
+        [np.asarray(points, np.float64)[labels == k] for k in range(3)],
+        noise_mm=noise_mm,
+        form_mm=form_mm,
+        most_askew_deg=most_askew_deg,
+    )
+
+
+def cube_faces(
+    points: np.ndarray, *, side_mm: float = SIDE_MM, reach_mm: float = REACH_MM, seed: int = 0
+) -> np.ndarray:
+    """[N] i8: which of three faces a point of a cube's scan is on, largest first; -1 for none.
+
+    Planes through three random points that most others lie on, the later ones square to the
+    earlier to 5 deg. Points within 1.5 mm of a second plane are on none: they may be mixed.
+
+    Args:
+      points: [N, 3] mm, of a scan of the cube and little else.
+      side_mm: of the cube; points farther from the corner than its faces reach are on none.
+      reach_mm: how far from its plane a point of a face may be, three times the noise.
+      seed: of the triplets: same seed, same result.
+
+    Raises:
+      InputError: fewer than three such planes.
+    """
+    points = np.asarray(points, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 9:
+        raise InputError(f"a cube needs a scan [N, 3] in mm, got {list(points.shape)}")
+    rng = np.random.default_rng(seed)
+    some = points[rng.permutation(len(points))[:TRIPLET_POINTS]]
+    normals, anchors = np.zeros((0, 3)), np.zeros((0, 3))
+    left = np.ones(len(some), bool)
+    for number in range(3):
+        plane = _likely_plane(some[left], normals, reach_mm, rng)
+        if plane is None or np.mean(plane[2]) * np.mean(left) < LEAST_SHARE:
+            raise InputError(
+                f"the scan shows {number} of the cube's faces, three are needed: tilt the cube so "
+                "that its corner points to the camera"
+            )
+        normals = np.concatenate([normals, plane[0][None]])
+        anchors = np.concatenate([anchors, plane[1][None]])
+        left &= np.abs((some - plane[1]) @ plane[0]) > 2 * reach_mm
+    height = np.abs(points @ normals.T - np.einsum("ki,ki->k", anchors, normals))
+    order = np.sort(height, axis=1)
+    corner = np.linalg.solve(normals, np.einsum("ki,ki->k", anchors, normals))
+    near = np.linalg.norm(points - corner, axis=1) < side_mm * np.sqrt(2) + EDGE_MM
+    on = (order[:, 0] < reach_mm) & (order[:, 1] > max(EDGE_MM, 2 * reach_mm)) & near
+    return np.where(on, np.argmin(height, axis=1), -1).astype(np.int8)
+
+
+def _likely_plane(
+    points: np.ndarray, square_to: np.ndarray, reach_mm: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Normal [3] and a point [3] of the plane most of the points lie on, and which those are."""
+    if len(points) < 9:
+        return None
+    a, b, c = points[rng.integers(len(points), size=(3, TRIPLETS))]
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    fit = length > 0
+    normal, a = normal[fit] / length[fit, None], a[fit]
+    fit = (np.abs(normal @ square_to.T) < np.sin(np.radians(5))).all(axis=1)
+    normal, a = normal[fit], a[fit]
+    if not len(normal):
+        return None
+    on = np.abs(points @ normal.T - np.einsum("ti,ti->t", normal, a)) < reach_mm
+    mine = on[:, np.argmax(np.count_nonzero(on, axis=0))]
+    if np.count_nonzero(mine) < 3:
+        return None
+    face = fit_face(points[mine])
+    return face.normal, face.center, np.abs(face.height_mm(points)) < reach_mm

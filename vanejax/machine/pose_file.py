@@ -1,0 +1,456 @@
+"""Poses in files: the JSON that a registration writes, and the guess that one starts from.
+
+Frames and units are stated in the file itself. Host numpy only.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import importlib.metadata
+import json
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from vanejax.errors import InputError
+from vanejax.files import write_text
+from vanejax.localization.pose_result import (
+    PointStatus,
+    PoseResult,
+    Status,
+    Uncertainty,
+    Verdict,
+    Verification,
+)
+from vanejax.rigid import RigidTransform
+
+FORMAT = "vanejax pose"
+VERSION = 1
+PACKAGES = ("vanejax", "jax", "jaxlib", "numpy", "embreex")
+
+CONVENTIONS = {
+    "camera": "frame of the scan file, mm",
+    "part": "frame of the CAD model, mm",
+    "part_from_camera": "4x4, row-major, on column vectors: [x_part, 1] = M [x_camera, 1]; mm",
+    "camera_from_part": "its inverse: where the part is in the scan; 4x4, row-major, mm",
+    "quaternion_wxyz": "unit, order w, x, y, z, with w >= 0",
+    "euler_xyz_deg": "angles (a, b, c) about the fixed axes x, then y, then z: "
+    "R = Rz(c) Ry(b) Rx(a); degrees",
+    "kuka": "X, Y, Z in mm; A, B, C in degrees with R = Rz(A) Ry(B) Rx(C)",
+    "shares": "0 to 1",
+    "null": "not known",
+}
+_UNCERTAINTY = (
+    "one sigma of white noise, of a small motion e = (rotation vector in rad, translation in mm) "
+    "about the part's centre c, in the part's frame: x -> c + exp(e[:3]) (x - c) + e[3:]. "
+    "Left out: calibration of the sensor, and how far the casting differs from its CAD model."
+)
+
+MAX_BYTES = 16 << 20
+MATRIX_TOLERANCE = 1e-3  # of a rotation's entries: three decimals are a matrix typed by hand
+
+
+def pose_to_dict(part_from_camera: RigidTransform) -> dict[str, Any]:
+    """A pose and its inverse as plain values; `CONVENTIONS` says what each is.
+
+    Args:
+      part_from_camera: rotation [3, 3], translation [3] in mm.
+    """
+    poses = {
+        "part_from_camera": part_from_camera,
+        "camera_from_part": part_from_camera.inverse(),
+    }
+    matrices = {name: np.asarray(pose.as_matrix(), np.float64) for name, pose in poses.items()}
+    found: dict[str, Any] = {name: matrix.tolist() for name, matrix in matrices.items()}
+    for name, matrix in matrices.items():
+        rotation = matrix[:3, :3]
+        found[f"{name}_as"] = {
+            "translation_mm": matrix[:3, 3].tolist(),
+            "quaternion_wxyz": quaternion_wxyz(rotation).tolist(),
+            "euler_xyz_deg": euler_xyz_deg(rotation).tolist(),
+            "kuka": kuka_frame(poses[name]),
+        }
+    return found
+
+
+def kuka_frame(pose: RigidTransform) -> dict[str, float]:
+    """X, Y, Z in mm and A, B, C in degrees of KUKA's FRAME: R = Rz(A) Ry(B) Rx(C).
+
+    A turns about z, B about the y so turned, C about the x turned twice (KUKA System Software,
+    operating and programming instructions). B is within -90 to 90; at either end A is 0.
+    """
+    x, y, z = np.asarray(pose.translation, np.float64).tolist()
+    a, b, c = euler_xyz_deg(pose.rotation).tolist()
+    return {"X": x, "Y": y, "Z": z, "A": c, "B": b, "C": a}
+
+
+def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternion [4] f64 (w, x, y, z) of a rotation [3, 3], with w >= 0.
+
+    From the largest of four forms (Shepperd, 1978), so that no root of nearly nothing is taken.
+    """
+    r = np.asarray(rotation, np.float64)
+    d0, d1, d2 = np.diag(r)
+    s = [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
+    p = [r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]]
+    forms = np.array(
+        [
+            [1 + d0 + d1 + d2, s[0], s[1], s[2]],
+            [s[0], 1 + d0 - d1 - d2, p[0], p[1]],
+            [s[1], p[0], 1 - d0 + d1 - d2, p[2]],
+            [s[2], p[1], p[2], 1 - d0 - d1 + d2],
+        ]
+    )
+    best = forms[np.argmax(np.diag(forms))]
+    best = best / np.linalg.norm(best)
+    return -best if best[0] < 0 else best
+
+
+def euler_xyz_deg(rotation: np.ndarray) -> np.ndarray:
+    """`vanejax.rigid.euler_xyz_deg` for one rotation [3, 3], in float64 on the host."""
+    r = np.asarray(rotation, np.float64)
+    cosine = np.hypot(r[0, 0], r[1, 0])
+    # below rounding only a - c or a + c is defined: c is 0
+    c = 0.0 if cosine < 10 * np.finfo(np.float64).eps else np.arctan2(r[1, 0], r[0, 0])
+    # of what is left when c is taken back: near b = 90 deg the error of c is in a as well, and the
+    # three together are right to rounding
+    a = np.arctan2(
+        np.sin(c) * r[0, 2] - np.cos(c) * r[1, 2], np.cos(c) * r[1, 1] - np.sin(c) * r[0, 1]
+    )
+    return np.degrees([a, np.arctan2(-r[2, 0], cosine), c])
+
+
+def result_to_dict(
+    result: PoseResult,
+    *,
+    scan_name: str,
+    part_name: str,
+    part_sha256: str,
+    seed: int | None = None,
+    weights_name: str | None = None,
+) -> dict[str, Any]:
+    """All that a registration found, but for what it says of each point, as plain values.
+
+    Args:
+      result: what `vanejax.register` gave.
+      scan_name, part_name: what was registered to what.
+      part_sha256: `Part.sha256`.
+      seed: of the registration.
+      weights_name: the trained matcher's file.
+
+    Returns:
+      What JSON can hold; a number that is not finite is None.
+    """
+    alternatives = [
+        pose_to_dict(other.part_from_camera)
+        | {
+            "rotation_from_the_answer_deg": other.rotation_deg,
+            "translation_from_the_answer_mm": other.translation_mm,
+            "inlier_share": other.inlier_share,
+        }
+        for other in result.alternatives
+    ]
+    refinement = result.refinement
+    return _plain(
+        {
+            "format": FORMAT,
+            "version": VERSION,
+            "conventions": CONVENTIONS,
+            "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            "versions": {name: _version(name) for name in PACKAGES},
+            "scan": {"name": scan_name, "sensor_origin_mm": result.sensor_origin},
+            "part": {"name": part_name, "sha256": part_sha256},
+            "seed": seed,
+            "weights": weights_name,
+            "verdict": {"status": result.verdict.status, "reason": result.verdict.reason},
+            **pose_to_dict(result.part_from_camera),
+            "uncertainty": _uncertainty(result.uncertainty),
+            "verification": _verification(result.verification),
+            "refinement": {
+                "method": refinement.method,
+                "converged": refinement.converged,
+                "iterations": refinement.iterations,
+                "noise_mm": refinement.noise_mm,
+                "points": refinement.num_points,
+                "inliers": refinement.num_inliers,
+                "information": refinement.information,
+                "allowance_mm": refinement.allowance_mm,
+                "allowance_sigma_mm": refinement.allowance_sigma_mm,
+            },
+            "alternatives": alternatives,
+            "before_refinement": {"part_from_camera": result.before.as_matrix()},
+            "notes": list(result.notes),
+            "seconds": dict(result.seconds),
+        }
+    )
+
+
+def write_result(path: str | os.PathLike[str], result: PoseResult, **names: Any) -> None:
+    """Writes `result_to_dict` as JSON; the file appears complete or not at all.
+
+    Args:
+      path: the file; `read_pose` reads it again.
+      result: what `vanejax.register` gave.
+      names: the keyword arguments of `result_to_dict`.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    values = result_to_dict(result, **names)
+    write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PoseRecord:
+    """What a pose file says that is needed to act on it.
+
+    Attributes:
+      part_from_camera: the pose, f64, mm.
+      verdict: of the registration; None where the file has none, such as one typed by hand.
+      part_sha256: `Part.sha256` of the part that was found; None where the file has none.
+    """
+
+    part_from_camera: RigidTransform
+    verdict: Verdict | None
+    part_sha256: str | None
+
+
+def read_record(path: str | os.PathLike[str]) -> PoseRecord:
+    """`read_pose`, with the verdict on it where the file has one.
+
+    Raises:
+      InputError: as `read_pose`; or the verdict is none of accepted, ambiguous, rejected.
+    """
+    path = Path(path)
+    text = read_text(path)
+    pose = parse_transform(text, where=str(path))
+    values = json.loads(text) if text.lstrip()[:1] == "{" else {}
+    verdict, part = values.get("verdict"), values.get("part")
+    if verdict is not None:
+        if not isinstance(verdict, dict) or verdict.get("status") not in get_args(Status):
+            raise InputError(
+                f"{path}: its verdict has no status {', '.join(get_args(Status))}; "
+                "write it again with `vanejax register --json`"
+            )
+        verdict = Verdict(verdict["status"], str(verdict.get("reason") or "no reason is given"))
+    sha256 = part.get("sha256") if isinstance(part, dict) else None
+    return PoseRecord(pose, verdict, sha256 if isinstance(sha256, str) else None)
+
+
+def read_pose(path: str | os.PathLike[str]) -> RigidTransform:
+    """Reads part_from_camera, for example as a first guess.
+
+    Args:
+      path: JSON that `write_result` wrote, or ``{"part_from_camera": M}``,
+        ``{"camera_from_part": M}``, or M alone, with M 4x4, row-major, mm (or ``{"matrix": M}``);
+        or text with the 16 numbers of part_from_camera row by row, lines with # left out.
+
+    Returns:
+      The pose, f64, its rotation the nearest one to what the file holds.
+
+    Raises:
+      InputError: no such file, no pose in it, or no rigid motion; names the file and the value.
+    """
+    return parse_transform(read_text(Path(path)), where=str(path))
+
+
+def parse_transform(
+    text: str, *, where: str, target: str = "part", source: str = "camera"
+) -> RigidTransform:
+    """The motion between any two frames from text that `read_pose` takes.
+
+    Args:
+      text: JSON or 16 numbers.
+      where: what the message of an error starts with.
+      target, source: names of the frames, in place of part and camera in the names of JSON; what
+        stands without a name is target_from_source.
+
+    Raises:
+      InputError: as `read_pose`.
+    """
+    if text.lstrip()[:1] in ("{", "["):
+        return _from_json(text, where, target, source)
+    words = re.sub(r"#.*", "", text).replace(",", " ").replace(";", " ").split()
+    try:
+        numbers = [float(word) for word in words[:17]]
+    except ValueError as error:
+        raise InputError(f"{where}: neither JSON nor 16 numbers ({error})") from None
+    if len(words) != 16:
+        raise InputError(
+            f"{where}: holds {len(words)} numbers; a pose is 16, the rows of a 4x4 matrix in mm"
+        )
+    return rigid_from_matrix(np.array(numbers).reshape(4, 4), where=where)
+
+
+def rigid_from_matrix(matrix: np.ndarray, *, where: str) -> RigidTransform:
+    """The rigid motion that a 4x4 matrix is meant to be.
+
+    Args:
+      matrix: [4, 4] f64; translation in mm.
+      where: what the message of an error starts with.
+
+    Returns:
+      Its translation, and the rotation nearest to its own: at most `MATRIX_TOLERANCE` away.
+
+    Raises:
+      InputError: not finite, or not a rigid motion; says what it is instead.
+    """
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{where}: the matrix holds a value that is not finite")
+    rotation = matrix[:3, :3]
+    if not np.allclose(matrix[3], [0, 0, 0, 1], rtol=0, atol=1e-9):
+        transposed = np.allclose(matrix[:, 3], [0, 0, 0, 1], rtol=0, atol=1e-9)
+        hint = "; it looks column-major: transpose it" if transposed else ""
+        raise InputError(f"{where}: the last row is {matrix[3].tolist()}, not 0, 0, 0, 1{hint}")
+    # before any product: entries of 1e200 would overflow it
+    if (largest := np.abs(rotation).max()) > 1e6:
+        raise InputError(f"{where}: no rotation: it has an entry of size {largest:.3g}, at most 1")
+    gram = rotation.T @ rotation
+    error = np.abs(gram - np.eye(3)).max()
+    if error > MATRIX_TOLERANCE:
+        scale = np.sqrt(np.trace(gram) / 3)
+        even = scale > 0 and np.abs(gram / scale**2 - np.eye(3)).max() <= MATRIX_TOLERANCE
+        hint = f"it scales by {scale:.4g}" if even else "its axes are not unit and square"
+        raise InputError(
+            f"{where}: no rotation: {hint} (R^T R differs from 1 by {error:.2g}, "
+            f"more than {MATRIX_TOLERANCE:g})"
+        )
+    if np.linalg.det(rotation) < 0:
+        raise InputError(
+            f"{where}: no rotation but a mirror image (determinant -1); "
+            "one axis has the wrong sign, or the frame is left-handed"
+        )
+    u, _, vt = np.linalg.svd(rotation)
+    return RigidTransform(rotation=u @ vt, translation=matrix[:3, 3].copy())
+
+
+def read_text(path: Path) -> str:
+    """The text of a pose file.
+
+    Raises:
+      InputError: no such file, no text, or too large to be a pose.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: is a folder or a device; a pose file is JSON or 16 numbers")
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(f"{path}: {size / 2**20:.0f} MiB are too large for a pose file")
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(
+            f"{path}: no such file (looked in {path.parent.absolute()}); it should hold a pose"
+        ) from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is no text; a pose file is JSON or 16 numbers") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _from_json(text: str, where: str, target: str, source: str) -> RigidTransform:
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{where}: is not valid JSON ({error})") from None
+    if isinstance(values, list):
+        return rigid_from_matrix(_matrix(values, where), where=where)
+    forward, backward = f"{target}_from_{source}", f"{source}_from_{target}"
+    poses = {
+        name: rigid_from_matrix(_matrix(values[name], f"{where}, {name}"), where=f"{where}, {name}")
+        for name in (forward, backward)
+        if name in values
+    }
+    if not poses:
+        there = ", ".join(map(repr, list(values)[:8])) or "nothing"
+        raise InputError(
+            f'{where}: has no "{forward}" and no "{backward}", each 4x4, row-major, '
+            f"mm; it has {there}"
+        )
+    if len(poses) == 2:
+        _check_inverse(poses[forward], poses[backward], f'{where}: "{forward}" and "{backward}"')
+    if forward in poses:
+        return poses[forward]
+    return poses[backward].inverse()
+
+
+def _check_inverse(one: RigidTransform, other: RigidTransform, names: str) -> None:
+    """Refuses a file in which only one of the two matrices was edited."""
+    rest = one @ other
+    # rounded entries of a rotation move a point that is far away
+    limit = MATRIX_TOLERANCE * (1 + np.linalg.norm(one.translation))
+    turned = np.abs(rest.rotation - np.eye(3)).max() > MATRIX_TOLERANCE
+    if turned or np.abs(rest.translation).max() > limit:
+        raise InputError(f"{names} are not inverse to each other; keep the one that is right")
+
+
+def _matrix(value: Any, where: str) -> np.ndarray:
+    """[4, 4] f64 from nested or flat lists of numbers, or from ``{"matrix": ...}``."""
+    if isinstance(value, dict):
+        value = value.get("matrix")
+    rows = value if isinstance(value, list) else []
+    if len(rows) == 4 and all(isinstance(row, list) and len(row) == 4 for row in rows):
+        rows = [number for row in rows for number in row]
+    wrong = [v for v in rows if isinstance(v, bool) or not isinstance(v, int | float)]
+    if len(rows) != 16 or wrong:
+        raise InputError(f"{where}: holds no 4x4 matrix: four rows of four numbers, mm")
+    try:
+        return np.array(rows, np.float64).reshape(4, 4)
+    except OverflowError:
+        raise InputError(f"{where}: the matrix holds a value that is not finite") from None
+
+
+def _uncertainty(uncertainty: Uncertainty) -> dict[str, Any]:
+    return {
+        "meaning": _UNCERTAINTY,
+        "center_mm": uncertainty.center,
+        "rotation_sigma_deg": uncertainty.rotation_sigma_deg,
+        "translation_sigma_mm": uncertainty.translation_sigma_mm,
+        "weakest_rotation": {
+            "axis": uncertainty.weakest_rotation_axis,
+            "sigma_deg": uncertainty.weakest_rotation_sigma_deg,
+        },
+        "weakest_translation": {
+            "axis": uncertainty.weakest_translation_axis,
+            "sigma_mm": uncertainty.weakest_translation_sigma_mm,
+        },
+        "covariance": uncertainty.covariance,
+    }
+
+
+def _verification(verification: Verification) -> dict[str, Any]:
+    counts = np.bincount(np.asarray(verification.status, np.int64), minlength=len(PointStatus))
+    return {
+        "inlier_share": verification.inlier_share,
+        "violation_share": verification.violation_share,
+        "unmeasured_share": verification.unmeasured_share,
+        "tolerance_mm": verification.tolerance_mm,
+        "points_checked": len(verification.checked),
+        "points": {status.name.lower(): counts[status] for status in PointStatus},
+    }
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _plain(value: Any) -> Any:
+    """Lists, dicts and Python numbers; a number that is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if value is None or isinstance(value, str | bool):
+        return value
+    array = np.asarray(value)
+    if array.ndim:
+        return _plain(array.tolist())
+    number = array.item()
+    return number if np.isfinite(number) else None

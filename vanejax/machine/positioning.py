@@ -1,0 +1,365 @@
+"""How far a part was turned and moved between two registrations, and how well that is known.
+
+Section IV of the paper. Two registrations of a fixed camera give the motion of the part in the
+camera's frame. It is projected on a known axis, to be compared with a rotary stage, or carried to
+the frame of a measuring machine (eq. 13), to be compared with probed points (eq. 12).
+
+A small motion e [6] is (rotation vector in rad, translation in mm) about a centre c, applied
+afterwards: ``x -> c + exp(e[:3]) (x - c) + e[3:]``. As in
+`vanejax.localization.pose_result.Uncertainty`, it is
+the error of what is reported: the truth is that small motion after the report. All is first order
+in it. Host code, float64.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vanejax.errors import InputError
+from vanejax.rigid import RigidTransform
+
+_STILL_RAD = 1e-9  # less is no rotation: its axis and point are rounding errors
+_FLIPPED = 1e-9  # of half a turn of swing: then every twist fits
+
+
+def camera_motion(before: RigidTransform, after: RigidTransform) -> RigidTransform:
+    """The part's motion in the camera's frame, from poses part_from_camera before and after it.
+
+    A point of the part, at x in the camera's frame before, is at ``motion.apply(x)`` after:
+    ``camera_from_part(after) @ part_from_camera(before)``. The paper's ``T = T2 T1^-1`` is the same
+    with T = camera_from_part, the motion from the model to the scan. With part_from_camera in that
+    order, ``after @ before.inverse()``, one gets the motion that the *part's* frame sees the camera
+    make: another axis, and the opposite angle.
+    """
+    return after.inverse() @ before
+
+
+def in_machine(motion: RigidTransform, machine_from_camera: RigidTransform) -> RigidTransform:
+    """The same motion in the machine's frame (eq. 13): ``T_CCM = T_b T_camera T_b^-1``.
+
+    Its rotation has the same angle; its translation is that of the point at the machine's origin.
+    """
+    return machine_from_camera @ motion @ machine_from_camera.inverse()
+
+
+def displacement(motion: RigidTransform, point: np.ndarray) -> np.ndarray:
+    """[3] mm: where the motion brings a point [3] of its frame, less where it was.
+
+    A registration's error of the angle counts for more the farther off the point is: compare
+    displacements at the part, not at the origin of a machine two metres away.
+    """
+    point = np.asarray(point, np.float64)
+    return motion.rotation @ point + motion.translation - point
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Screw:
+    """A motion as one turn about an axis and one slide along it (Chasles).
+
+    Attributes:
+      axis: [3] unit; of a pure translation its direction, of no motion at all z.
+      angle_deg: 0 to 180, counter-clockwise seen against the axis.
+      point: [3] mm, the point of the axis that is nearest the origin; of a pure translation 0.
+      along_mm: the slide.
+    """
+
+    axis: np.ndarray
+    angle_deg: float
+    point: np.ndarray
+    along_mm: float
+
+    @property
+    def pitch_mm(self) -> float:
+        """Slide per full turn; infinite for a pure translation."""
+        return 360 * self.along_mm / self.angle_deg if self.angle_deg else float("inf")
+
+    @property
+    def motion(self) -> RigidTransform:
+        """Inverse of `screw_of`."""
+        rotation = Rotation.from_rotvec(np.radians(self.angle_deg) * self.axis).as_matrix()
+        return RigidTransform(
+            rotation, self.point - rotation @ self.point + self.along_mm * self.axis
+        )
+
+
+def screw_of(motion: RigidTransform) -> Screw:
+    """Equivalent axis and angle of a motion, with the place of the axis and the slide along it."""
+    turn = Rotation.from_matrix(motion.rotation).as_rotvec()
+    angle = float(np.linalg.norm(turn))
+    shift = np.asarray(motion.translation, np.float64)
+    if angle < _STILL_RAD:
+        length = float(np.linalg.norm(shift))
+        axis = shift / length if length else np.array([0.0, 0.0, 1.0])
+        return Screw(axis, 0.0, np.zeros(3), length)
+    axis = turn / angle
+    along = float(axis @ shift)
+    across = shift - along * axis
+    # (I - R) p = across, solved in the plane across the axis
+    point = 0.5 * (across + np.cross(axis, across) / np.tan(angle / 2))
+    return Screw(axis, float(np.degrees(angle)), point, along)
+
+
+@dataclasses.dataclass(frozen=True)
+class Twist:
+    """A rotation as a turn about a known axis, then a swing about one square to it.
+
+    Attributes:
+      angle_deg: the turn, above -180 to 180.
+      swing_deg: 0 to 180: what is left over; 0 if the rotation is about that axis.
+    """
+
+    angle_deg: float
+    swing_deg: float
+
+
+def twist_about(rotation: np.ndarray, axis: np.ndarray) -> Twist:
+    """The turn of a rotation [3, 3] about an axis [3]: its swing-twist decomposition.
+
+    Of all turns about the axis this is the one nearest to the rotation.
+
+    Raises:
+      InputError: an axis that is no direction, or a rotation that swings by half a turn, which no
+        angle about the axis is nearer to than any other.
+    """
+    real, along, imaginary = _about(rotation, axis)
+    length = float(np.hypot(real, along))
+    if length < _FLIPPED:
+        raise InputError(
+            "the rotation turns the axis round (swing 180 deg): it has no angle about it; is the "
+            "axis given in the rotation's frame?"
+        )
+    angle = np.degrees(2 * np.arctan2(along, real))
+    across = float(np.linalg.norm(imaginary - along * _unit(axis)))
+    swing = float(np.degrees(2 * np.arctan2(across, length)))
+    return Twist(float(wrapped_deg(angle)), swing)
+
+
+def wrapped_deg(angle: np.ndarray | float) -> np.ndarray | float:
+    """The same angle above -180 and up to 180 deg."""
+    return -np.mod(180.0 - np.asarray(angle, np.float64), 360.0) + 180.0
+
+
+def _unit(axis: np.ndarray) -> np.ndarray:
+    axis = np.asarray(axis, np.float64)
+    length = np.linalg.norm(axis)
+    if axis.shape != (3,) or not 0 < length < np.inf:
+        raise InputError(f"an axis must be a direction, three numbers not all 0; got {axis}")
+    return axis / length
+
+
+def _about(rotation: np.ndarray, axis: np.ndarray) -> tuple[float, float, np.ndarray]:
+    """The quaternion's real part, its imaginary part along the unit axis, and that part itself."""
+    *imaginary, real = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    imaginary = np.asarray(imaginary)
+    return float(real), float(imaginary @ _unit(axis)), imaginary
+
+
+def common_axis(rotations: np.ndarray) -> np.ndarray:
+    """[3] unit: the axis that rotations [K, 3, 3] share best, of a rotary stage for example.
+
+    The principal direction of the quaternions' imaginary parts: their squared swing is least. Its
+    sign is that of most of the given turns, weighted by their size.
+
+    Raises:
+      InputError: no rotation, or none that turns by more than rounding.
+    """
+    rotations = np.asarray(rotations, np.float64).reshape(-1, 3, 3)
+    imaginary = (
+        Rotation.from_matrix(rotations).as_quat(canonical=True)[:, :3]
+        if len(rotations)
+        else np.zeros((0, 3))
+    )
+    values, vectors = np.linalg.eigh(imaginary.T @ imaginary)
+    if values[-1] < _STILL_RAD**2:
+        raise InputError("no rotation to find an axis from: turn the part between the scans")
+    axis = vectors[:, -1]
+    return axis if np.sum(imaginary @ axis) >= 0 else -axis
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ProbedMotion:
+    """The motion of a body of which some points were probed before and after.
+
+    Attributes:
+      motion: in the probe's frame.
+      rms_mm: of what is left of the K points, over their 3 K - 6 degrees of freedom; 0 if there
+        are none.
+    """
+
+    motion: RigidTransform
+    rms_mm: float
+
+
+def probe_translation(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """[3] mm: the mean motion of probed points [K, 3], the true translation of eq. 12.
+
+    As printed, ``1/4 sum(1P_i - jP_i)``, it is the way back from position j to the first; here it
+    is the way there, as T2 T1^-1 is.
+
+    Raises:
+      InputError: not as many points before and after, or none.
+    """
+    before, after = _pairs(before, after, least=1)
+    return np.mean(after - before, axis=0)
+
+
+def probe_motion(before: np.ndarray, after: np.ndarray) -> ProbedMotion:
+    """The rigid motion that fits probed points [K, 3] best, K at least 3 and not on one line.
+
+    Beside the translation of eq. 12 it tells whether the stage turned the part as well.
+
+    Raises:
+      InputError: points that fix no motion.
+    """
+    before, after = _pairs(before, after, least=3)
+    start, end = before.mean(axis=0), after.mean(axis=0)
+    spread = np.linalg.svd(before - start, compute_uv=False)
+    if spread[1] < 1e-6 * max(spread[0], 1e-30):
+        raise InputError("the probed points lie on one line: no rotation follows; probe others")
+    rotation = Rotation.align_vectors(after - end, before - start)[0].as_matrix()
+    motion = RigidTransform(rotation, end - rotation @ start)
+    left = after - motion.apply(before)
+    free = 3 * len(before) - 6
+    return ProbedMotion(motion, float(np.sqrt(np.sum(left**2) / free)) if free else 0.0)
+
+
+def _pairs(before: np.ndarray, after: np.ndarray, *, least: int) -> tuple[np.ndarray, np.ndarray]:
+    before, after = np.asarray(before, np.float64), np.asarray(after, np.float64)
+    if before.shape != after.shape or before.ndim != 2 or before.shape[1] != 3:
+        raise InputError(
+            f"probed points must be [K, 3] mm, the same before and after; got {before.shape} and "
+            f"{after.shape}"
+        )
+    if len(before) < least:
+        raise InputError(f"{len(before)} probed points are too few; at least {least} are needed")
+    if not (np.isfinite(before).all() and np.isfinite(after).all()):
+        raise InputError("probed points must be finite, in mm")
+    return before, after
+
+
+# Errors to first order. e about c is v + w x (x - c): two matrices carry it anywhere.
+
+
+def turned(rotation: np.ndarray) -> np.ndarray:
+    """[6, 6]: a small motion about c, in another frame and about the same c there.
+
+    ``rotation`` [3, 3] is that of other_from_this.
+    """
+    both = np.zeros((6, 6))
+    both[:3, :3] = both[3:, 3:] = rotation
+    return both
+
+
+def recentred(center: np.ndarray, new_center: np.ndarray) -> np.ndarray:
+    """[6, 6]: a small motion about ``center`` as one about ``new_center``: v + w x (new - old)."""
+    x, y, z = np.asarray(new_center, np.float64) - center
+    out = np.eye(6)
+    out[3:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+    return out
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MotionErrors:
+    """How errors of two registrations and of the calibration reach the motion they give.
+
+    The error of the motion, a small motion about ``center`` applied after it, is
+    ``of_before @ e_before + of_after @ e_after + of_calibration @ e_calibration``.
+
+    Attributes:
+      center: [3] mm, machine frame: the part's centre after the motion.
+      of_before, of_after: [6, 6], of errors as `Uncertainty` has them, about the part's centre.
+        They are opposite: what both registrations have in common cancels, as seen from the part.
+      of_calibration: [6, 6], of an error of machine_from_camera, applied after it.
+    """
+
+    center: np.ndarray
+    of_before: np.ndarray
+    of_after: np.ndarray
+    of_calibration: np.ndarray
+
+    def covariance(
+        self, before: np.ndarray, after: np.ndarray, calibration: np.ndarray | None = None
+    ) -> np.ndarray:
+        """[6, 6] of the motion, from independent covariances [6, 6]; None for a known frame."""
+        maps = [(self.of_before, before), (self.of_after, after)]
+        if calibration is not None:
+            maps.append((self.of_calibration, calibration))
+        return sum(way @ matrix @ way.T for way, matrix in maps)
+
+    def common(
+        self, before: np.ndarray, after: np.ndarray, calibration: np.ndarray | None = None
+    ) -> np.ndarray:
+        """[6, K]: what K causes do to the motion that act on everything at once.
+
+        Args:
+          before, after: [6, K], what each does to the registrations.
+          calibration: [6, K], what it does to machine_from_camera; None for nothing.
+
+        ``common @ common.T`` is a covariance if the columns are for one standard deviation of
+        independent causes.
+        """
+        total = self.of_before @ before + self.of_after @ after
+        return total if calibration is None else total + self.of_calibration @ calibration
+
+
+def motion_errors(
+    before: RigidTransform,
+    after: RigidTransform,
+    part_center: np.ndarray,
+    *,
+    machine_from_camera: RigidTransform | None = None,
+    calibration_center: np.ndarray | None = None,
+) -> MotionErrors:
+    """Where errors of poses part_from_camera go in ``in_machine(camera_motion(before, after))``.
+
+    With the errors E of the poses and of the calibration B, all applied after them, the true motion
+    is ``E_B (B after^-1 (E_after^-1 E_before) after B^-1) (M E_B^-1 M^-1) M``.
+
+    Args:
+      before, after: as reported.
+      part_center: [3] mm, part frame, about which their errors are.
+      machine_from_camera: None: the machine's frame is the camera's.
+      calibration_center: [3] mm, machine frame, about which its error is; None for its origin.
+    """
+    if machine_from_camera is None:
+        machine_from_camera = RigidTransform.identity(dtype=np.float64)
+    machine_from_part = machine_from_camera @ after.inverse()
+    center = machine_from_part.rotation @ part_center + machine_from_part.translation
+    carried = turned(machine_from_part.rotation)
+    motion = in_machine(camera_motion(before, after), machine_from_camera)
+    place = np.zeros(3) if calibration_center is None else np.asarray(calibration_center)
+    arrived = motion.rotation @ place + motion.translation
+    calibration = recentred(place, center) - recentred(arrived, center) @ turned(motion.rotation)
+    return MotionErrors(center, carried, -carried, calibration)
+
+
+def twist_gradient(rotation: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """[3] rad per rad: how `twist_about`'s angle changes with a small rotation after it.
+
+    With the quaternion (q0, q): ``(q0 (q0 a + q x a) + (q . a) q) / (q0^2 + (q . a)^2)``; of a
+    rotation about the axis a itself, a.
+    """
+    real, along, imaginary = _about(rotation, axis)
+    axis = _unit(axis)
+    turned_axis = real * axis + np.cross(imaginary, axis)
+    return (real * turned_axis + along * imaginary) / (real**2 + along**2)
+
+
+def angle_sigma_deg(covariance: np.ndarray, rotation: np.ndarray, axis: np.ndarray) -> float:
+    """Standard deviation of the angle about an axis, from a motion's covariance [6, 6]."""
+    gradient = twist_gradient(rotation, axis)
+    return float(np.degrees(np.sqrt(gradient @ covariance[:3, :3] @ gradient)))
+
+
+def displacement_covariance(
+    covariance: np.ndarray, center: np.ndarray, arrived: np.ndarray
+) -> np.ndarray:
+    """[3, 3] mm^2, of `displacement`, from a motion's covariance [6, 6] about ``center``.
+
+    ``arrived`` [3] is where the motion brings the point; the point before it is taken as known.
+    """
+    way = recentred(center, arrived)[3:]
+    return way @ covariance @ way.T

@@ -1,0 +1,204 @@
+"""DCP: Deep Closest Point v2 (Wang and Solomon, ICCV 2019).
+
+Features of both clouds (`Dgcnn`), made to depend on each other by a transformer, point each source
+point softly at the target; the rigid motion is the least-squares fit to where they point, every
+point counting alike. There is no slack: each source point has a partner, whether it has one or not.
+
+Coordinates are in unit-sphere units: the part's centre is the origin, its radius is 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from vanejax.matching.baselines.dgcnn import Dgcnn
+from vanejax.matching.baselines.transformer import Encoded, Transformer
+from vanejax.matching.contract import Register, Registration
+from vanejax.matching.iteration import last_iteration
+from vanejax.matching.procrustes import weighted_procrustes
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+
+_MASKED = -1e9
+
+
+@flax.struct.dataclass
+class Embedding:
+    """A cloud as far as it depends on no other.
+
+    Attributes:
+      features: [N, width] f32, of the `Dgcnn`.
+      encoded: of the transformer.
+    """
+
+    features: jax.Array
+    encoded: Encoded
+
+
+@flax.struct.dataclass
+class Match:
+    """One iteration of DCP.
+
+    Attributes:
+      target_from_source: the total motion after this iteration.
+      scores: [N, M] f32, how well source and target points agree; -1e9 at padding of either.
+      partners: [N, 3] f32, where each source point points at; of no meaning at padding.
+    """
+
+    target_from_source: RigidTransform
+    scores: jax.Array
+    partners: jax.Array
+
+    @property
+    def log_assignment(self) -> jax.Array:
+        """Log of the pointer [N, M]: the exponentials of a real row sum to 1."""
+        return jax.nn.log_softmax(self.scores, axis=1)
+
+
+class Dcp(nn.Module):
+    """DCP for one pair; `jax.vmap` over pairs.
+
+    Attributes:
+      width: channels of a feature.
+      num_neighbors: K of the graph, the point itself counted.
+      heads: of every attention; divides ``width``.
+      hidden: channels inside a feed-forward layer.
+    """
+
+    width: int = 512
+    num_neighbors: int = 20
+    heads: int = 4
+    hidden: int = 1024
+
+    def setup(self) -> None:
+        """Names the two networks."""
+        self.dgcnn = Dgcnn(self.width, self.num_neighbors)
+        self.transformer = Transformer(self.width, self.heads, self.hidden)
+
+    def embed(self, cloud: PointCloud) -> Embedding:
+        """All that a cloud [N] brings to a match: for the reference, once per part."""
+        features = self.dgcnn(cloud.xyz, cloud.mask)
+        return Embedding(features=features, encoded=self.transformer.encode(features, cloud.mask))
+
+    def match(
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        target_embedding: Embedding,
+        target_from_source: RigidTransform,
+    ) -> Match:
+        """One iteration from the pose ``target_from_source``, which is held constant."""
+        moved = source.replace(xyz=target_from_source.apply(source.xyz))
+        of_source, of_target = self.embed(moved), target_embedding
+        decode = self.transformer.decode
+        from_source = of_source.features + decode(of_source.encoded, of_target.encoded, target.mask)
+        from_target = of_target.features + decode(of_target.encoded, of_source.encoded, source.mask)
+        scores = jnp.matmul(from_source * self.width**-0.5, from_target.T)
+        real = source.mask[:, None] & target.mask[None, :]
+        scores = jnp.where(real, scores, _MASKED)
+        partners = jnp.matmul(
+            jax.nn.softmax(scores, axis=1), target.xyz, precision=jax.lax.Precision.HIGHEST
+        )
+        weights = source.mask.astype(partners.dtype)
+        return Match(
+            target_from_source=weighted_procrustes(source.xyz, partners, weights),
+            scores=scores,
+            partners=partners,
+        )
+
+    def __call__(
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        init: RigidTransform,
+        iterations: int,
+        target_embedding: Embedding | None = None,
+    ) -> list[Match]:
+        """All iterations from ``init``, the last one last, to look at; `last_match` is faster.
+
+        Args:
+          source: [N] points.
+          target: [M] points, the reference.
+          init: target_from_source to start from.
+          iterations: static; 1 as published.
+          target_embedding: of `embed`, to share it between pairs.
+        """
+        if target_embedding is None:
+            target_embedding = self.embed(target)
+        matches: list[Match] = []
+        pose = init
+        for _ in range(iterations):
+            matches.append(self.match(source, target, target_embedding, pose))
+            pose = jax.lax.stop_gradient(matches[-1].target_from_source)
+        return matches
+
+
+def last_match(
+    model: Dcp,
+    variables: Mapping[str, Any],
+    source: PointCloud,
+    target: PointCloud,
+    init: RigidTransform,
+    *,
+    iterations: int,
+    target_embedding: Embedding | None = None,
+) -> Match:
+    """The last of several iterations; see `last_iteration`.
+
+    Args:
+      model, variables: the network and its weights.
+      source: [N] points.
+      target: [M] points, the reference.
+      init: target_from_source to start from.
+      iterations: static, at least 1.
+      target_embedding: of `Dcp.embed`, where several pairs share it.
+    """
+    if target_embedding is None:
+        target_embedding = model.apply(variables, target, method="embed")
+
+    def match(pose: RigidTransform) -> Match:
+        return model.apply(variables, source, target, target_embedding, pose, method="match")
+
+    return last_iteration(match, init, iterations=iterations)
+
+
+def dcp(model: Dcp, variables: Mapping[str, Any], *, iterations: int = 1) -> Register:
+    """A trained DCP as a `Register`: source and target in unit-sphere units.
+
+    More than the published one iteration feeds the moved source through the network again.
+    ``init`` is the answer where a cloud is empty or the network's answer is not finite.
+    """
+
+    def register(
+        source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
+    ) -> Registration:
+        del key  # nothing here is random
+        match = last_match(model, variables, source, target, init, iterations=iterations)
+        return _registration(source, target, init, match, iterations)
+
+    return register
+
+
+def _registration(
+    source: PointCloud, target: PointCloud, init: RigidTransform, match: Match, iterations: int
+) -> Registration:
+    """The common result type from the last iteration."""
+    found = match.target_from_source
+    both = jnp.any(source.mask) & jnp.any(target.mask)
+    converged = both & jnp.all(jnp.isfinite(found.as_matrix()))
+    pose = jax.tree.map(lambda new, old: jnp.where(converged, new, old), found, init)
+    residual = jnp.where(converged, pose.apply(source.xyz) - match.partners, 0.0)
+    squared = jnp.sum(jnp.sum(residual**2, -1), where=source.mask)
+    return Registration(
+        target_from_source=pose,
+        converged=converged,
+        iterations=jnp.asarray(iterations, jnp.int32),
+        rmse=jnp.sqrt(squared / jnp.maximum(jnp.sum(source.mask), 1)),
+        overlap=both.astype(jnp.float32),
+    )

@@ -1,0 +1,92 @@
+"""DGCNN: features of points from the shape around them (Wang et al., ACM ToG 2019), as in DCP.
+
+DCP's published code builds the graph once, from coordinates, and keeps it for all layers; the
+original DGCNN builds it anew from the features of each layer. Each edge carries the neighbour's
+and the point's own coordinates, not their difference. Published convolutions have no bias and are
+followed by batch normalisation; here it is group normalisation over the real points of one cloud
+(`vanejax.matching.layers`), for which a bias is no redundancy: it has one. A cloud's features then
+depend on neither the batch nor a running average.
+"""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from vanejax.matching.layers import (
+    DenseNormRelu,
+    DenseNormReluMax,
+    GroupNorm,
+    Linear,
+    neighbor_sums,
+    product,
+    product_moments,
+)
+from vanejax.pointcloud import squared_distances
+
+
+def neighbor_graph(xyz: jax.Array, mask: jax.Array, *, num_neighbors: int) -> jax.Array:
+    """Each point's nearest real points, itself among them.
+
+    Args:
+      xyz: [N, 3] f32, any unit.
+      mask: [N] bool; padding is no one's neighbour.
+      num_neighbors: K; in a cloud with fewer points the point itself fills the places left over.
+
+    Returns:
+      indices [N, K] i32, the nearest first, the lower index first among equals; min(K, N) columns.
+    """
+    away = jnp.where(mask[None, :], squared_distances(xyz, xyz), jnp.inf)
+    negative, index = jax.lax.top_k(-away, min(num_neighbors, len(xyz)))
+    itself = jnp.arange(len(xyz), dtype=index.dtype)
+    return jnp.where(jnp.isfinite(negative), index, itself[:, None])
+
+
+class EdgeLayer(nn.Module):
+    """`DenseNormRelu` on every edge, and its maximum over the neighbours.
+
+    The maximum is that of the bare product. Of the activations, which XLA may compute anew for the
+    backward pass and round otherwise, none might then equal it: a gradient of 0 / 0.
+    """
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """From x [N, K, C] with mask [N] to edges [N, K, features] and points [N, features]."""
+        kernel, bias = Linear(self.features, name="dense")(x.shape[-1])
+        norm = GroupNorm(self.features, num_groups=8, name="norm")
+        scale, shift = norm(*product_moments(x, kernel, mask), bias)
+        y = product(x, kernel * scale[None, :])
+        top, _ = neighbor_sums(y)
+        return nn.relu(y + shift[None, None, :]), nn.relu(top + shift[None, :])
+
+
+class Dgcnn(nn.Module):
+    """Shared MLP over the edges, the maximum over the neighbours after each of its layers.
+
+    Attributes:
+      width: channels of a feature.
+      num_neighbors: K, the point itself counted.
+      edge_widths: channels of the layers over the edges.
+    """
+
+    width: int = 512
+    num_neighbors: int = 20
+    edge_widths: tuple[int, ...] = (64, 64, 128, 256)
+
+    @nn.compact
+    def __call__(self, xyz: jax.Array, mask: jax.Array) -> jax.Array:
+        """From xyz [N, 3] f32 and mask [N] bool to features [N, width] f32, not negative."""
+        index = neighbor_graph(xyz, mask, num_neighbors=self.num_neighbors)
+        center = jnp.broadcast_to(xyz[:, None, :], (*index.shape, 3))
+        x = jnp.concatenate([jnp.take(xyz, index, axis=0), center], -1)
+        tops = []
+        for layer, features in enumerate(self.edge_widths[:-1]):
+            x, top = EdgeLayer(features, name=f"edge_{layer}")(x, mask)
+            tops.append(top)
+        last = len(self.edge_widths) - 1
+        # no layer needs this one's edges: its maximum is taken before the normalisation
+        tops.append(DenseNormReluMax(self.edge_widths[-1], name=f"edge_{last}")(x, mask))
+        return DenseNormRelu(self.width, name="point")(jnp.concatenate(tops, -1), mask)

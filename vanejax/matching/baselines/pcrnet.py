@@ -1,0 +1,132 @@
+"""PCRNet: a pose read from two PointNet features (Sarode et al., arXiv:1908.07906, 2019).
+
+The iterative form: one network looks at the source where it lies now and at the template, and
+answers with the motion that is left; the next iteration starts from there with the same weights.
+
+Nothing is centred, as published: the network knows coordinates in the frame and the unit that it
+was trained in, unit-sphere units of the part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from vanejax.matching.baselines.pointnet import (
+    WIDTHS,
+    DenseLayers,
+    cloud_feature,
+    dense_relu,
+    registration_from_pose,
+)
+from vanejax.matching.contract import Register, Registration
+from vanejax.matching.se3 import hat
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+
+
+class PcrNet(nn.Module):
+    """PCRNet for one pair; `jax.vmap` over pairs.
+
+    The pose is held constant between iterations when gradients are taken. The dropout that is
+    published for noisy data is left out: it needs keys, and the pairs drawn here never repeat.
+
+    Attributes:
+      head: channels of the hidden layers that read the pose.
+    """
+
+    head: tuple[int, ...] = (1024, 1024, 512, 512, 256)
+
+    def setup(self) -> None:
+        """The encoder, the head and its last layer."""
+        self.encoder = DenseLayers(WIDTHS)
+        self.hidden = DenseLayers((2 * WIDTHS[-1], *self.head))
+        self.pose_kernel = self.param("pose_kernel", nn.initializers.zeros, (self.head[-1], 7))
+        # translation 0 and quaternion (1, 0, 0, 0): the first answer moves nothing
+        self.pose_bias = self.param("pose_bias", lambda _: jnp.eye(7)[3])
+
+    def template(self, target: PointCloud) -> jax.Array:
+        """The feature [1024] of a target [M]: once per part."""
+        return cloud_feature(self.encoder(), target.xyz, target.mask)
+
+    def __call__(
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        init: RigidTransform,
+        iterations: int,
+        template: jax.Array | None = None,
+    ) -> RigidTransform:
+        """The total motion after each iteration from ``init``, along a leading axis.
+
+        Args:
+          source: [N] points.
+          target: [M] points, the template.
+          init: target_from_source to start from.
+          iterations: static, at least 1; 8 as published.
+          template: [1024] from `template`, to share it between pairs.
+        """
+        if template is None:
+            template = self.template(target)
+        encoder, hidden = self.encoder(), self.hidden()
+
+        def iteration(pose: RigidTransform, _: None) -> tuple[RigidTransform, RigidTransform]:
+            feature = cloud_feature(encoder, pose.apply(source.xyz), source.mask)
+            x = dense_relu(hidden, jnp.concatenate([feature, template])[None, :])
+            answer = (x @ self.pose_kernel)[0] + self.pose_bias
+            rest = RigidTransform(rotation=_rotation(answer[3:]), translation=answer[:3])
+            total = rest @ pose
+            return jax.lax.stop_gradient(total), total
+
+        start = jax.tree.map(lambda leaf: jnp.asarray(leaf, source.xyz.dtype), init)
+        return jax.lax.scan(iteration, start, length=iterations)[1]
+
+
+def _rotation(quaternion: jax.Array) -> jax.Array:
+    """[3, 3] of a quaternion [4] = (w, x, y, z) of any length; the identity where that is 0."""
+    squared = jnp.sum(quaternion**2)
+    unit = quaternion * jax.lax.rsqrt(jnp.maximum(squared, 1e-20))
+    k = hat(unit[1:])
+    square = jnp.matmul(k, k, precision=jax.lax.Precision.HIGHEST)
+    return jnp.eye(3, dtype=k.dtype) + 2 * unit[0] * k + 2 * square
+
+
+def pcrnet(
+    model: PcrNet,
+    variables: Mapping[str, Any],
+    *,
+    iterations: int = 8,
+    partner_distance: float = 0.1,
+) -> Register:
+    """A trained PCRNet as a `Register`: source and target in unit-sphere units.
+
+    It has no measure of its own for having converged: an answer counts as such if it is finite and
+    brings a source point near the target.
+
+    Args:
+      model, variables: the network and its weights.
+      iterations: at least 1; 8 as published.
+      partner_distance: see `pointnet.registration_from_pose`; unit-sphere units (on the vane, 1 is
+        73 mm).
+    """
+
+    def register(
+        source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
+    ) -> Registration:
+        del key  # nothing here is random
+        poses = model.apply(variables, source, target, init, iterations)
+        return registration_from_pose(
+            source,
+            target,
+            jax.tree.map(lambda leaf: leaf[-1], poses),
+            init,
+            settled=jnp.asarray(True),
+            iterations=iterations,
+            partner_distance=partner_distance,
+        )
+
+    return register

@@ -1,0 +1,250 @@
+"""PointNetLK: Lucas and Kanade's algorithm on PointNet features (Aoki et al., CVPR 2019).
+
+The inverse compositional form: how the template's feature changes with its pose is found once, and
+every iteration turns the difference of the two clouds' features into a step of the source.
+
+Coordinates are in one unit, the length ``delta`` too: unit-sphere units, where the part's radius
+is 1.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import flax.linen as nn
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vanejax.errors import InputError
+from vanejax.matching.baselines.pointnet import (
+    WIDTHS,
+    DenseLayers,
+    Layers,
+    cloud_feature,
+    registration_from_pose,
+)
+from vanejax.matching.contract import Register, Registration
+from vanejax.matching.se3 import exp_se3
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+
+_EXACT = jax.lax.Precision.HIGHEST
+
+
+@flax.struct.dataclass
+class Template:
+    """What does not change while sources are aligned to one target.
+
+    Attributes:
+      mean: [3] f32, of the target's points; the origin that it was described about.
+      feature: [C] f32.
+      twist_from_feature: [6, C] f32, the Jacobian's pseudo-inverse.
+    """
+
+    mean: jax.Array
+    feature: jax.Array
+    twist_from_feature: jax.Array
+
+
+@flax.struct.dataclass
+class LucasKanadeSteps:
+    """All iterations of PointNetLK, along a leading axis I.
+
+    Attributes:
+      target_from_source: [I] the total motion after each iteration.
+      twist: [I, 6] f32, the step taken: rotation in radians, translation.
+      residual: [I, C] f32, feature of the source before the step minus the template's.
+    """
+
+    target_from_source: RigidTransform
+    twist: jax.Array
+    residual: jax.Array
+
+
+class PointNetLK(nn.Module):
+    """PointNetLK for one pair; `jax.vmap` over pairs.
+
+    The pose is held constant between iterations when gradients are taken, as in RPM-Net; the
+    published code differentiates through all of them.
+
+    Attributes:
+      delta: step of the Jacobian's differences: radians, and the clouds' unit.
+      damping: added to the normal equations' diagonal, relative to its mean.
+      origin: what both clouds are centred on. "means", as published: each on its own mean, so that
+        only the rotation of ``init`` counts; the mean of a partial scan is a guess that the
+        iterations have to undo. "target": both on the target's mean.
+    """
+
+    delta: float = 0.01
+    damping: float = 1e-6
+    origin: Literal["means", "target"] = "means"
+
+    def setup(self) -> None:
+        """The encoder."""
+        self.encoder = DenseLayers(WIDTHS)
+
+    def template(self, target: PointCloud) -> Template:
+        """Describes a target [M]: once per part, seven passes of the encoder.
+
+        Column k of the Jacobian is ``(phi(P) - phi(exp(-delta e_k) P)) / delta``.
+        """
+        layers = self.encoder()
+        mean = _mean(target.xyz, target.mask)
+        centered = target.xyz - mean[None, :]
+        feature = cloud_feature(layers, centered, target.mask)
+
+        def column(twist: jax.Array) -> jax.Array:
+            moved = exp_se3(-twist).apply(centered)
+            return (feature - cloud_feature(layers, moved, target.mask)) / self.delta
+
+        # one after the other: a pass fits the caches, six side by side do not
+        columns = jax.lax.map(column, self.delta * jnp.eye(6, dtype=feature.dtype))
+        normal = jnp.matmul(columns, columns.T, precision=_EXACT)
+        # of no weight where the Jacobian has full rank; without it, no answer where it has not
+        ridge = self.damping * jnp.trace(normal) / 6 + 1e-12
+        factor = jax.scipy.linalg.cho_factor(normal + ridge * jnp.eye(6, dtype=normal.dtype))
+        return Template(
+            mean=mean,
+            feature=feature,
+            twist_from_feature=jax.scipy.linalg.cho_solve(factor, columns),
+        )
+
+    def __call__(
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        init: RigidTransform,
+        iterations: int,
+        template: Template | None = None,
+    ) -> LucasKanadeSteps:
+        """All iterations from ``init``.
+
+        Args:
+          source: [N] points.
+          target: [M] points, the template.
+          init: target_from_source to start from.
+          iterations: static, at least 1.
+          template: from `template`, to share it between pairs.
+        """
+        if template is None:
+            template = self.template(target)
+        layers = self.encoder()
+        moved = init.apply(source.xyz)
+        mean = _mean(moved, source.mask) if self.origin == "means" else template.mean
+        centered = source.replace(xyz=moved - mean[None, :])
+        eye = jnp.eye(3, dtype=moved.dtype)
+        template_from_target = RigidTransform(rotation=eye, translation=-template.mean)
+        source_from_init = RigidTransform(rotation=eye, translation=-mean) @ init
+
+        def iteration(
+            template_from_source: RigidTransform, _: None
+        ) -> tuple[RigidTransform, LucasKanadeSteps]:
+            twist, residual = _step(layers, template, centered, template_from_source)
+            pose = exp_se3(twist) @ template_from_source
+            total = template_from_target.inverse() @ pose @ source_from_init
+            return jax.lax.stop_gradient(pose), LucasKanadeSteps(total, twist, residual)
+
+        start = RigidTransform(rotation=eye, translation=jnp.zeros_like(mean))
+        return jax.lax.scan(iteration, start, length=iterations)[1]
+
+
+def _step(
+    layers: Layers, template: Template, source: PointCloud, template_from_source: RigidTransform
+) -> tuple[jax.Array, jax.Array]:
+    """The twist [6] that brings the moved source's feature to the template's, and the residual."""
+    moved = template_from_source.apply(source.xyz)
+    residual = cloud_feature(layers, moved, source.mask) - template.feature
+    return -jnp.matmul(template.twist_from_feature, residual, precision=_EXACT), residual
+
+
+def _mean(xyz: jax.Array, mask: jax.Array) -> jax.Array:
+    """Mean [3] of the real points of xyz [N, 3]; 0 where there are none."""
+    return jnp.sum(xyz, 0, where=mask[:, None]) / jnp.maximum(jnp.sum(mask), 1)
+
+
+def pointnetlk(
+    model: PointNetLK,
+    variables: Mapping[str, Any],
+    *,
+    iterations: int = 10,
+    tolerance: float = 1e-2,
+    partner_distance: float = 0.1,
+) -> Register:
+    """A trained PointNetLK as a `Register`.
+
+    Args:
+      model, variables: the network and its weights; they fix the clouds' unit, as a rule
+        unit-sphere units (on the vane, 1 is 73 mm).
+      iterations: at least 1; 10 as published.
+      tolerance: it has converged where the last step's twist is shorter (radians and the clouds'
+        unit).
+      partner_distance: see `pointnet.registration_from_pose`.
+    """
+
+    def register(
+        source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
+    ) -> Registration:
+        del key  # nothing here is random
+        steps = model.apply(variables, source, target, init, iterations)
+        return registration_from_pose(
+            source,
+            target,
+            jax.tree.map(lambda leaf: leaf[-1], steps.target_from_source),
+            init,
+            settled=jnp.linalg.norm(steps.twist[-1]) < tolerance,
+            iterations=iterations,
+            partner_distance=partner_distance,
+        )
+
+    return register
+
+
+def variables_from_torch(state_dict: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Flax variables from a published PyTorch state dict, by name.
+
+    Its batch normalisation, in evaluation, is affine and goes into the kernels.
+
+    Args:
+      state_dict: name to array, as `vanejax.matching.torch_weights.load_state_dict` reads it.
+
+    Raises:
+      InputError: a name is missing or unknown, a shape is not PointNetLK's, a value not finite, a
+        variance negative, or the Jacobian's step is not 0.01.
+    """
+    left = dict(state_dict)
+
+    def take(name: str, *shape: int) -> np.ndarray:
+        if name not in left:
+            raise InputError(f"the state dict has no {name!r}: it is not a published PointNetLK's")
+        value = np.asarray(left.pop(name), np.float64)
+        # the kernel of a convolution has an axis of length 1 behind these
+        if value.shape[: len(shape)] != shape or value.size != np.prod(shape):
+            raise InputError(f"{name!r} has shape {value.shape}: PointNetLK's has {shape}")
+        if not np.isfinite(value).all():
+            raise InputError(f"{name!r} holds values that are not finite: its training diverged")
+        return value.reshape(shape)
+
+    if not np.allclose(take("dt", 1, 6), PointNetLK.delta):
+        raise InputError("'dt' is not 0.01: a learned step of the Jacobian is not supported")
+    encoder: dict[str, np.ndarray] = {}
+    for index, (channels, features) in enumerate(itertools.pairwise(WIDTHS)):
+        convolution, norm = (f"feature_model.{kind}{index + 1}" for kind in ("conv", "bn"))
+        kernel = take(f"{convolution}.weight", features, channels).T
+        bias = take(f"{convolution}.bias", features)
+        gain, shift = take(f"{norm}.weight", features), take(f"{norm}.bias", features)
+        mean = take(f"{norm}.running_mean", features)
+        variance = take(f"{norm}.running_var", features)
+        if variance.min() < 0:
+            raise InputError(f"'{norm}.running_var' holds a negative variance")
+        left.pop(f"{norm}.num_batches_tracked", None)  # a count, of no effect in evaluation
+        scale = gain / np.sqrt(variance + 1e-5)  # PyTorch's epsilon
+        encoder[f"kernel_{index}"] = np.float32(kernel * scale)
+        encoder[f"bias_{index}"] = np.float32((bias - mean) * scale + shift)
+    if left:
+        names = ", ".join(sorted(left)[:5])
+        raise InputError(f"the state dict has entries PointNetLK lacks: {names}")
+    return {"params": {"encoder": encoder}}

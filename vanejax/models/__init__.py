@@ -1,1 +1,0 @@
-"""Learned registration networks."""

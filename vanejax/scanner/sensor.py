@@ -1,0 +1,280 @@
+"""A structured-light camera: what goes wrong in it, each with its unit, and three that are known.
+
+A projector stands beside the camera, ``baseline_mm`` along the camera's +x; what it does not light
+is not measured. The rest is triangulated: errors of the disparity in pixels become errors of the
+depth that grow with its square (`range_errors`), and light that is too much or too little leaves
+holes (`exposure`). Every effect has its own switch; `measurement` applies them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from vanejax.errors import InputError
+from vanejax.scanner.camera import Camera
+from vanejax.scanner.exposure import REFERENCE_MM, Exposure
+from vanejax.scanner.range_errors import Lens, Trueness
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensor:
+    """A structured-light camera; the defaults are an ideal one.
+
+    Attributes:
+      camera: intrinsics and clip planes.
+      baseline_mm: from the camera to the projector, along the camera's +x (negative: to its left).
+      shadow: whether what the projector does not see is left out.
+      most_incidence_deg: surfaces seen flatter are not measured; 90 for no limit.
+      incidence_spread_deg: standard deviation of that limit from place to place, smooth over
+        ``correlation_px``.
+      exposure: light and shine; None: every surface is bright enough and none too bright.
+      noise_px: standard deviation of the disparity, white; at `Exposure.reference_signal` if there
+        is an exposure.
+      correlated_px: standard deviation of an error of the disparity that is smooth in the image,
+        and new in every scan.
+      correlation_px: its length, see `range_errors.smooth_field`.
+      window_px: the matching window of a stereo camera, as the standard deviation of a Gaussian: it
+        rounds edges off, see `range_errors.windowed`; 0 for a camera that codes single pixels.
+      adhesion_px: standard deviation, in columns and in rows, of how far beside its pixel the
+        texture lies that a window matched; smooth over ``correlation_px``. The error grows with the
+        slope of the surface.
+      rim_px: how wide a strip along the part's outline finds no match, on average; its width
+        varies as the correlated error does, see `range_errors.rim`.
+      mixed_share: of the places where the depth jumps, those where a pixel mixes both sides.
+      jump_mm: what difference of neighbouring depths is a jump.
+      step_px, step_mm: disparities, and depths, are rounded to multiples of it; 0 for none.
+      lens: what calibration leaves of the lens; None for nothing.
+      trueness: what it leaves of the depth; None for nothing.
+      lost_share: of the pixels, lost singly.
+      outlier_share: of the measured points, those that lie anywhere within ``outlier_mm`` of depth.
+      outlier_mm: largest error of an outlier.
+
+    Raises:
+      InputError: a value that no sensor can have.
+    """
+
+    camera: Camera = dataclasses.field(default_factory=Camera)
+    baseline_mm: float = 120.0
+    shadow: bool = False
+    most_incidence_deg: float = 90.0
+    incidence_spread_deg: float = 0.0
+    exposure: Exposure | None = None
+    noise_px: float = 0.0
+    correlated_px: float = 0.0
+    correlation_px: float = 16.0
+    window_px: float = 0.0
+    adhesion_px: float = 0.0
+    rim_px: float = 0.0
+    mixed_share: float = 0.0
+    jump_mm: float = 2.0
+    step_px: float = 0.0
+    step_mm: float = 0.0
+    lens: Lens | None = None
+    trueness: Trueness | None = None
+    lost_share: float = 0.0
+    outlier_share: float = 0.0
+    outlier_mm: float = 20.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.baseline_mm) and self.baseline_mm):
+            raise InputError(f"sensor: baseline_mm={self.baseline_mm!r} must be a length, not 0")
+        if not 0 < self.most_incidence_deg <= 90:
+            raise InputError(
+                f"sensor: most_incidence_deg={self.most_incidence_deg!r} must lie in (0, 90]"
+            )
+        for name in (
+            "noise_px",
+            "correlated_px",
+            "incidence_spread_deg",
+            "window_px",
+            "adhesion_px",
+            "rim_px",
+            "step_px",
+            "step_mm",
+            "outlier_mm",
+            "jump_mm",
+        ):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"sensor: {name}={getattr(self, name)!r} must be 0 or more")
+        if not 1 <= self.correlation_px < math.inf:
+            raise InputError(f"sensor: correlation_px={self.correlation_px!r} must be 1 or more")
+        for name in ("mixed_share", "lost_share", "outlier_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(
+                    f"sensor: {name}={getattr(self, name)!r} must be a share from 0 to 1"
+                )
+
+    @property
+    def focal_baseline(self) -> float:
+        """Focal length times baseline, pixels times mm: the depth times the disparity."""
+        return self.camera.fx * abs(self.baseline_mm)
+
+    def range_sigma_mm(self, depth_mm: float) -> float:
+        """Standard deviation of the depth that ``noise_px`` makes: ``z^2 / (f b) noise_px``."""
+        return depth_mm**2 / self.focal_baseline * self.noise_px
+
+    def scaled(self, factor: float) -> Sensor:
+        """The same errors in mm with ``factor`` times the pixels per side."""
+        factors = self.camera.scaled(factor).width / self.camera.width
+        lens = self.lens
+        if lens is not None:
+            columns, rows = lens.center_error_px
+            lens = dataclasses.replace(lens, center_error_px=(columns * factors, rows * factors))
+        return dataclasses.replace(
+            self,
+            camera=self.camera.scaled(factor),
+            noise_px=self.noise_px * factors,
+            correlated_px=self.correlated_px * factors,
+            correlation_px=max(1.0, self.correlation_px * factors),
+            window_px=self.window_px * factors,
+            adhesion_px=self.adhesion_px * factors,
+            rim_px=self.rim_px * factors,
+            step_px=self.step_px * factors,
+            lens=lens,
+        )
+
+    def exposed_for(self, distance_mm: float) -> Sensor:
+        """The same with the exposure that a part at this distance needs.
+
+        An exposure that suits 400 mm is longer by the square of the distance: the projector's light
+        spreads.
+        """
+        if self.exposure is None:
+            return self
+        factor = (distance_mm / REFERENCE_MM) ** 2
+        exposure = dataclasses.replace(
+            self.exposure, exposure_ms=factor * self.exposure.exposure_ms
+        )
+        return dataclasses.replace(self, exposure=exposure)
+
+    def another(self, rng: np.random.Generator, *, spread: float = 0.3) -> Sensor:
+        """Another camera of this kind, as its maker's next one would be.
+
+        Errors of calibration are normally distributed with this sensor's as standard deviations;
+        all other magnitudes, light and finish of the surface among them, are multiplied by the
+        exponential of a normal number of standard deviation ``spread``. Settings of the matching,
+        such as its window, stay.
+        """
+
+        def vary(value: float) -> float:
+            return value * math.exp(spread * rng.standard_normal())
+
+        def normal(value: float) -> float:
+            return value * rng.standard_normal()
+
+        exposure, lens, trueness = self.exposure, self.lens, self.trueness
+        if exposure is not None:
+            exposure = dataclasses.replace(
+                exposure,
+                exposure_ms=vary(exposure.exposure_ms),
+                ambient_per_ms=vary(exposure.ambient_per_ms),
+                ambient_towards=(*rng.standard_normal(2), abs(rng.standard_normal()) + 0.3),
+                specular=min(1.0, vary(exposure.specular)),
+                roughness=vary(exposure.roughness),
+            )
+        if lens is not None:
+            lens = Lens(
+                *(normal(value) for value in (lens.k1, lens.k2, lens.p1, lens.p2)),
+                focal_error=normal(lens.focal_error),
+                center_error_px=tuple(normal(value) for value in lens.center_error_px),
+            )
+        if trueness is not None:
+            trueness = Trueness(
+                scale=normal(trueness.scale),
+                bend_mm=tuple(normal(value) for value in trueness.bend_mm),
+            )
+        return dataclasses.replace(
+            self,
+            exposure=exposure,
+            lens=lens,
+            trueness=trueness,
+            noise_px=vary(self.noise_px),
+            correlated_px=vary(self.correlated_px),
+            correlation_px=max(1.0, vary(self.correlation_px)),
+            mixed_share=min(1.0, vary(self.mixed_share)),
+            lost_share=min(1.0, vary(self.lost_share)),
+            outlier_share=min(1.0, vary(self.outlier_share)),
+        )
+
+
+def ideal() -> Sensor:
+    """The paper's virtual camera: a z-buffer."""
+    return Sensor()
+
+
+def paper_camera() -> Sensor:
+    """The structured-light camera of the paper's Table 2, good to 0.1 mm at 300 and 1 at 1300 mm.
+
+    That is read as a bound on 95 % of the errors, noise and trueness together; what the table does
+    not say (baseline, light, calibration) is usual for such cameras. Its near clip plane is at
+    200 mm, not at the 300 of the working range: a renderer's clip plane cuts the part open, which
+    no camera does.
+    """
+    return Sensor(
+        camera=dataclasses.replace(Camera(), near_mm=200.0),
+        baseline_mm=120.0,
+        shadow=True,
+        most_incidence_deg=78.0,
+        exposure=Exposure(),
+        noise_px=0.05,
+        correlated_px=0.02,
+        correlation_px=16.0,
+        mixed_share=0.5,
+        step_px=1 / 64,
+        lens=Lens(k1=1e-3, k2=1e-3, p1=1e-4, p2=1e-4, focal_error=1e-4, center_error_px=(0.1, 0.1)),
+        trueness=Trueness(scale=1e-4, bend_mm=(0.02, 0.02)),
+        lost_share=2e-3,
+        outlier_share=5e-4,
+    )
+
+
+def consumer_depth() -> Sensor:
+    """A short-range stereo depth camera, in steps of 1 mm.
+
+    The focal length is that of the pixel grid of 15 real scans; the magnitudes are those for which
+    virtual scans of the same parts in the same poses have residuals, steps and holes most alike
+    (`experiments.sensor_fit`, on every other scan; docs/real_scans.md). The baseline is that of
+    such a camera.
+    """
+    width, height, focal = 424, 240, 212.945
+    opening = [math.degrees(2 * math.atan(size / (2 * focal))) for size in (width, height)]
+    return Sensor(
+        camera=Camera(
+            width=width,
+            height=height,
+            fov_x_deg=opening[0],
+            fov_y_deg=opening[1],
+            near_mm=50.0,
+        ),
+        baseline_mm=18.0,
+        shadow=True,
+        most_incidence_deg=76.0,
+        incidence_spread_deg=10.0,
+        noise_px=0.005,
+        correlated_px=0.044,
+        correlation_px=14.0,
+        window_px=2.6,
+        adhesion_px=1.1,
+        rim_px=0.87,
+        mixed_share=0.5,
+        jump_mm=10.0,
+        step_mm=1.0,
+        lost_share=0.017,
+    )
+
+
+PRESETS = {"ideal": ideal, "paper_camera": paper_camera, "consumer_depth": consumer_depth}
+
+
+def preset(name: str) -> Sensor:
+    """The sensor of a name in `PRESETS`.
+
+    Raises:
+      InputError: there is none.
+    """
+    if name not in PRESETS:
+        raise InputError(f"no sensor {name!r}; there are {', '.join(PRESETS)}")
+    return PRESETS[name]()

@@ -1,0 +1,457 @@
+"""The virtual structured-light scanner: Embree rays against the part. Only this file knows embreex.
+
+What embreex would otherwise do to its callers, and what is done about it here:
+
+* everything is float32: the scene is centred on the part, rays start just in front of it instead
+  of at the camera, and Embree's answer is used for one thing, *which* triangle is hit; the range
+  is then the exact float64 intersection of the pixel's ray with that triangle's plane;
+* a miss is triangle -1 at distance 1e37, normals are not unit vectors, distances are in lengths
+  of the direction vector, and a ``dists`` array is overwritten in place: none of them is read,
+  and the array given is always a fresh one;
+* the scene is built on the first query, which is not safe from two threads: the constructor asks
+  one. After that queries release the GIL, so threads share one scene.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from tqdm import tqdm
+
+from vanejax.cad.part import Part
+from vanejax.errors import InputError
+from vanejax.rigid import RigidTransform
+from vanejax.scanner.camera import Camera, Viewpoints
+from vanejax.scanner.image_window import Envelope, Window
+from vanejax.scanner.pixel_rays import EDGE_ON_COSINE, MeasuredPixels, PixelRays
+
+T = TypeVar("T")
+
+RAYS_PER_STRIP = 24 * 1024  # what is computed of this many rays stays in the cache
+FACES_AT_ONCE = 1 << 14
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Hits:
+    """Where N rays first meet the part, in the part's frame.
+
+    Attributes:
+      distance_mm: [N] f64, mm from the origin along the unit ray; inf at a miss.
+      face: [N] i32, index of the triangle; -1 at a miss.
+      normals: [N, 3] f64, unit, outward, so facing the ray's origin; zero at a miss.
+    """
+
+    distance_mm: np.ndarray
+    face: np.ndarray
+    normals: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scan:
+    """What one view measures, ideally: one point per pixel that sees the part, in pixel order.
+
+    Attributes:
+      points: [N, 3] f32, mm, camera frame.
+      normals: [N, 3] f32, unit, camera frame, of the triangle hit, facing the camera.
+      face: [N] i32, index into the part's triangles.
+      pixel: [N] i32, ``row * camera.width + column``, ascending.
+      camera_from_part: the pose label; numpy f64 [3, 3] and [3], mm.
+      hidden: [H, 3] f32, mm, camera frame: those of the area-uniform surface samples that the view
+        does not see (the red cloud of the paper's Fig. 5); None unless asked for.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    face: np.ndarray
+    pixel: np.ndarray
+    camera_from_part: RigidTransform
+    hidden: np.ndarray | None = None
+
+    @functools.cached_property
+    def range_mm(self) -> np.ndarray:
+        """[N] f32, mm along the ray from the camera: the length of ``points``."""
+        return np.linalg.norm(self.points.astype(np.float64), axis=-1).astype(np.float32)
+
+    @functools.cached_property
+    def incidence_deg(self) -> np.ndarray:
+        """[N] f32, angle between the normal and the way back to the camera, 0 to 90."""
+        points, normals = self.points.astype(np.float64), self.normals.astype(np.float64)
+        # not by acos, which turns float32's rounding of a normal into 0.02 deg at 0 deg
+        sine = np.linalg.norm(np.cross(normals, points), axis=-1)
+        cosine = -np.einsum("ni,ni->n", normals, points)
+        return np.degrees(np.arctan2(sine, cosine)).astype(np.float32)
+
+
+class Scanner:
+    """Casts rays at one part. Safe to share between threads; the same call gives the same bits.
+
+    Args:
+      part: what to scan.
+      surface_samples: number of surface points among which `scan` looks for hidden ones.
+      seed: of those samples.
+    """
+
+    def __init__(self, part: Part, *, surface_samples: int = 20_000, seed: int = 0) -> None:
+        self.part = part
+        self._surface_samples, self._seed = surface_samples, seed
+        self._center = np.asarray(part.center, np.float64)
+        vertices = np.asarray(part.mesh.vertices, np.float64) - self._center
+        self._radius = float(np.linalg.norm(vertices, axis=-1).max())
+        self._envelope = Envelope.around(vertices)
+        self._planes = np.empty((len(part.mesh.faces), 4))
+        for faces, corners in self._triangles():
+            self._planes[faces] = _planes_of(corners)
+        # robust: without it rays slip between two triangles that share an edge
+        self._scene = EmbreeScene(robust=True)
+        TriangleMesh(
+            self._scene,
+            vertices.astype(np.float32),
+            np.ascontiguousarray(part.mesh.faces, np.int32),
+        )
+        self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def _triangles(self) -> Iterator[tuple[slice, np.ndarray]]:
+        """Faces and their corners [K, 3, 3] f64, mm, about the centre: not all at a time."""
+        vertices, faces = np.asarray(self.part.mesh.vertices), np.asarray(self.part.mesh.faces)
+        for first in range(0, len(faces), FACES_AT_ONCE):
+            some = slice(first, min(first + FACES_AT_ONCE, len(faces)))
+            yield some, vertices[faces[some]] - self._center
+
+    def cast(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
+        """First intersections of any rays with the part, seen from outside.
+
+        A ray that first meets the back of a face counts as a miss: it started inside the solid, or
+        it met a vertex exactly and slipped in, which Embree's robust mode prevents at edges only.
+        Open surfaces are seen from both sides.
+
+        Args:
+          origins: [N, 3] mm, part frame.
+          directions: [N, 3], part frame, any length but zero.
+
+        Raises:
+          InputError: shapes that do not match, or a direction that is zero or not finite.
+        """
+        origins = np.asarray(origins, np.float64)
+        directions = np.asarray(directions, np.float64)
+        if origins.ndim != 2 or origins.shape != directions.shape or origins.shape[1] != 3:
+            raise InputError(
+                f"rays need [N, 3] origins and directions, got {origins.shape}, {directions.shape}"
+            )
+        length = np.linalg.norm(directions, axis=-1, keepdims=True)
+        if not (np.isfinite(length).all() and np.isfinite(origins).all() and (length > 0).all()):
+            raise InputError("rays need finite origins and finite directions that are not zero")
+        return self.cast_unit(origins - self._center, directions / length)
+
+    def cast_unit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
+        """`cast` without its checks, for the inner loop of a registration.
+
+        Args:
+          origins: [..., 3] f64 mm, about the part's centre; broadcast against ``directions``.
+          directions: [..., 3] f64, unit.
+
+        Returns:
+          Hits with [...] in place of [N].
+        """
+        # jump to just before the part's bounding sphere, where float32 is finest
+        skip = -np.einsum("...i,...i->...", origins, directions) - 1.01 * self._radius
+        starts = origins + np.maximum(skip, 0)[..., None] * directions
+        face = self._scene.run(
+            starts.reshape(-1, 3).astype(np.float32), directions.reshape(-1, 3).astype(np.float32)
+        ).reshape(directions.shape[:-1])
+        planes = self._planes.take(face, axis=0, mode="wrap")  # of any face where none is hit
+        normals = np.ascontiguousarray(planes[..., :3])
+        closing = np.einsum("...i,...i->...", normals, directions)
+        gap = planes[..., 3] - np.einsum("...i,...i->...", normals, origins)
+        if not self.part.closed:  # the normal that faces the ray counts
+            side = -np.sign(closing)
+            normals *= side[..., None]
+            gap, closing = side * gap, side * closing
+        missed = (face < 0) | (closing >= -EDGE_ON_COSINE)
+        closing[missed] = 1.0
+        distance = gap / closing
+        distance[missed] = np.inf
+        face[missed] = -1
+        normals[missed] = 0.0
+        return Hits(distance_mm=distance, face=face.astype(np.int32), normals=normals)
+
+    def scan(
+        self, camera: Camera, camera_from_part: RigidTransform, *, hidden: bool = False
+    ) -> Scan:
+        """One view of the part.
+
+        The clip planes work as a renderer's do (the paper renders with PCL): they are depths along
+        the optical axis, what lies before the near plane is cut away, and what stood behind it is
+        then seen, if need be from its inside. Rays start at the near plane for that reason.
+
+        Args:
+          camera: intrinsics.
+          camera_from_part: rotation [3, 3] and translation [3] mm, as in `Viewpoints.view`.
+          hidden: whether to compute `Scan.hidden` as well.
+
+        Raises:
+          InputError: no pixel sees the part (the message says why), or the camera stands inside it.
+        """
+        rotation = np.asarray(camera_from_part.rotation, np.float64)
+        translation = np.asarray(camera_from_part.translation, np.float64)
+        if rotation.shape != (3, 3) or translation.shape != (3,):
+            raise InputError(f"a scan needs one pose, got rotations of shape {rotation.shape}")
+        label = RigidTransform(rotation, translation)
+        # "local" is the part's frame moved to the part's centre
+        camera_from_local = RigidTransform(rotation, translation + rotation @ self._center)
+        self._refuse_camera_inside(camera_from_local)
+        measured = self._measure(camera, camera_from_local)
+        if not len(measured.pixel):
+            depth_mm = -label.apply(np.asarray(self.part.mesh.vertices))[:, 2]
+            windows = self._windows(camera, camera_from_local)
+            raise InputError(_why_nothing_is_seen(camera, depth_mm, windows))
+        return Scan(
+            points=measured.points,
+            normals=measured.normals,
+            face=measured.face,
+            pixel=measured.pixel,
+            camera_from_part=label,
+            hidden=self._hidden(camera, camera_from_local) if hidden else None,
+        )
+
+    def _measure(self, camera: Camera, camera_from_local: RigidTransform) -> MeasuredPixels:
+        """What the pixels see, strip by strip of the image."""
+        windows = self._windows(camera, camera_from_local)
+        rays = self._rays(camera, camera_from_local)
+        measured = MeasuredPixels(sum(window.size for window in windows))
+        # to turn every plane once is cheaper than one for each hit, unless they are more
+        once = len(self._planes) <= len(measured.pixel)
+        planes = rays.facing(self._planes) if once else self._planes
+        for window in windows:
+            face = self._scene.run(*rays.through(window))
+            hit = np.flatnonzero(face >= 0)
+            face = face.take(hit)
+            plane = planes.take(face, axis=0)
+            measured.add(rays, *window.pixels(hit), face, plane if once else rays.facing(plane))
+        measured.cut()
+        return measured
+
+    def _windows(self, camera: Camera, camera_from_local: RigidTransform) -> list[Window]:
+        """The strips of the image in which the part may be seen."""
+        return self._envelope.windows(camera, camera_from_local, pixels=RAYS_PER_STRIP)
+
+    def _rays(self, camera: Camera, camera_from_local: RigidTransform) -> PixelRays:
+        """The view's rays, from the near plane or just before the part, whichever is farther."""
+        corners = camera_from_local.apply(self._envelope.corners)
+        nearest = -corners[:, 2].max()
+        cut_open = nearest < camera.near_mm and self._nearest_mm(camera_from_local) < camera.near_mm
+        return PixelRays.of(
+            camera,
+            camera_from_local,
+            start_mm=max(camera.near_mm, nearest),
+            farthest_mm=np.linalg.norm(corners, axis=-1).max(),
+            # the back of a solid that is whole means that a ray slipped in through a vertex, as in
+            # `cast`
+            backs=cut_open or not self.part.closed,
+        )
+
+    def _nearest_mm(self, camera_from_local: RigidTransform) -> float:
+        """The depth of the part's nearest vertex."""
+        back = camera_from_local.rotation[2]
+        along = (np.asarray(self.part.mesh.vertices) - self._center) @ back
+        return float(-along.max() - camera_from_local.translation[2])
+
+    @functools.cached_property
+    def _surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """Area-uniform points [S, 3] about the part's centre, and their normals [S, 3]; f64."""
+        points, normals, _ = self.part.sample(self._surface_samples, self._seed)
+        return points - self._center, normals
+
+    def _hidden(self, camera: Camera, camera_from_local: RigidTransform) -> np.ndarray:
+        """The surface samples [H, 3] f32, camera frame, that this view does not see.
+
+        A sample is seen when it lies between the clip planes, projects into the image, is not
+        edge-on, and the way from it to the near plane is free. That last test also decides which
+        samples face away: their way leads through the solid.
+        """
+        points_local, normals_local = self._surface
+        points = camera_from_local.apply(points_local)
+        normals = camera_from_local.rotate(normals_local)
+        depth = -points[:, 2]
+        pixel = camera.project(points)
+        size = np.array([camera.width, camera.height])
+        inside = np.all((pixel >= 0) & (pixel < size), axis=-1)
+        inside &= (depth >= camera.near_mm) & (depth <= camera.far_mm)
+        points, normals = points[inside], normals[inside]
+        towards = points / points[:, 2:]  # one unit of the ray's parameter is 1 mm of depth
+        cosine = np.einsum("ni,ni->n", normals, towards) / np.linalg.norm(towards, axis=-1)
+        # leave the sample's own triangle by several float32 roundings, on the camera's side
+        lift = 3e-5 * self._radius * np.sign(cosine)
+        lifted = points + lift[:, None] * normals
+        local_from_camera = camera_from_local.inverse()
+        starts = local_from_camera.apply(lifted)
+        directions = local_from_camera.rotate(towards)
+        blocker = self._scene.run(
+            starts.astype(np.float32),
+            directions.astype(np.float32),
+            dists=(-lifted[:, 2] - camera.near_mm).astype(np.float32),
+            query="OCCLUDED",
+        )
+        seen = inside
+        seen[inside] = (blocker < 0) & (np.abs(cosine) > EDGE_ON_COSINE)
+        return camera_from_local.apply(points_local[~seen]).astype(np.float32)
+
+    def lit(
+        self,
+        points: np.ndarray,
+        normals: np.ndarray,
+        towards: np.ndarray,
+        camera_from_part: RigidTransform,
+    ) -> np.ndarray:
+        """Whether light reaches points on the surface.
+
+        Args:
+          points, normals: [N, 3] f32, camera frame, mm and unit, as a `Scan` has them.
+          towards: [N, 3] f32 mm, or [3] for parallel light, camera frame: from each point to the
+            light. What stands in between shades the point, on its own face too.
+          camera_from_part: of the scan.
+
+        Returns:
+          [N] bool.
+        """
+        rotation = np.asarray(camera_from_part.rotation, np.float64)
+        center = camera_from_part.apply(self._center[None])
+        lit = np.einsum("ni,ni->n" if towards.ndim == 2 else "ni,i->n", normals, towards) > 0
+        facing = np.flatnonzero(lit)
+        # leave the face by several float32 roundings, on the side of the light
+        lift = np.float32(3e-5 * self._radius)
+        starts = points.take(facing, axis=0) - center.astype(np.float32)
+        starts += lift * normals.take(facing, axis=0)
+        ways = towards.take(facing, axis=0) if towards.ndim == 2 else towards[None]
+        turn = rotation.astype(np.float32)
+        ways = np.broadcast_to(_turned(ways, turn), starts.shape)
+        blocker = self._scene.run(
+            _turned(starts, turn),
+            np.ascontiguousarray(ways),
+            dists=np.ones(len(facing), np.float32),
+            query="OCCLUDED",
+        )
+        lit[facing] = blocker < 0
+        return lit
+
+    def _refuse_camera_inside(self, camera_from_local: RigidTransform) -> None:
+        """Raises InputError for a camera inside the solid.
+
+        That is where the first face in any direction is seen from its back. The direction taken is
+        that of the face that looks largest from the camera, so that it is neither edge-on nor far.
+        """
+        eye = camera_from_local.inverse().translation
+        if np.linalg.norm(eye) > self._radius:
+            return
+        largest, direction = 0.0, np.ones((1, 3))
+        for faces, corners in self._triangles():
+            middle = corners.mean(axis=1) - eye
+            area = np.linalg.norm(
+                np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+            )
+            distance = np.maximum(np.linalg.norm(middle, axis=-1), 1e-6 * self._radius)
+            towards = np.abs(np.einsum("ni,ni->n", self._planes[faces, :3], middle))
+            solid_angle = area * towards / distance**3
+            face = np.argmax(solid_angle)
+            if solid_angle[face] > largest:
+                largest, direction = solid_angle[face], middle[[face]]
+        face = self._scene.run(eye[None].astype(np.float32), direction.astype(np.float32))[0]
+        if face >= 0 and self._planes[face, :3] @ direction[0] > 0:
+            raise InputError(
+                f"the camera at {np.round(eye + self._center, 3)} mm (part frame) is inside the "
+                f"part {self.part.name}; move it at least camera.near_mm away"
+            )
+
+
+def scan_views(
+    part: Part,
+    camera: Camera,
+    viewpoints: Viewpoints,
+    *,
+    transform: Callable[[Scan], T] = lambda scan: scan,
+    hidden: bool = False,
+    workers: int | None = None,
+    progress: bool = True,
+) -> list[T]:
+    """Scans a part from every viewpoint, on all cores.
+
+    A view of 200,000 points takes 6 MB, so 216 of them do not belong in memory: ``transform`` is
+    applied to each scan in the thread that made it, and only its result is kept.
+
+    Args:
+      part: what is seen.
+      camera: by what.
+      viewpoints: from where; V views.
+      transform: from `Scan` to what is kept of it, such as a thinned cloud; runs in threads.
+      hidden: whether `Scan.hidden` is wanted.
+      workers: number of threads; None for one per core. Does not change the result.
+      progress: whether to show a progress bar.
+
+    Returns:
+      V results in the order of the viewpoints.
+
+    Raises:
+      InputError: a view that does not see the part; the message names the view.
+    """
+    if workers is not None and workers < 1:
+        raise InputError(f"workers must be at least 1, got {workers}")
+    scanner = Scanner(part)
+
+    def one(index: int) -> T:
+        try:
+            scan = scanner.scan(camera, viewpoints.view(index), hidden=hidden)
+        except InputError as error:
+            elevation, azimuth = viewpoints.elevation_deg[index], viewpoints.azimuth_deg[index]
+            where = f"view {index} (elevation {elevation:g} deg, azimuth {azimuth:g} deg)"
+            raise InputError(f"{where}: {error}") from error
+        return transform(scan)
+
+    # an error, or Ctrl-C, leaves the generator of `map`, which cancels the views not yet begun
+    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+        results = pool.map(one, range(len(viewpoints)))
+        bar = tqdm(results, "scanning", len(viewpoints), unit="view", disable=not progress)
+        return list(bar)
+
+
+def _turned(vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Rows [N, 3] times ``turn`` [3, 3], by blocks for which BLAS starts no threads."""
+    turned = np.empty_like(vectors)
+    for first in range(0, len(vectors), FACES_AT_ONCE):
+        some = slice(first, first + FACES_AT_ONCE)
+        np.matmul(vectors[some], turn, out=turned[some])
+    return turned
+
+
+def _planes_of(corners: np.ndarray) -> np.ndarray:
+    """Planes [K, 4] f64 of triangles [K, 3, 3]: outward unit normal and distance, mm."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    # a triangle without area has no normal; zero makes it edge-on to every ray
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    return np.column_stack([normals, np.einsum("ni,ni->n", normals, a)])
+
+
+def _why_nothing_is_seen(camera: Camera, depth_mm: np.ndarray, windows: list[Window]) -> str:
+    """The message for a view without a point, from the depths [V] of the part's vertices."""
+    nearest, farthest = depth_mm.min(), depth_mm.max()
+    where = f"the part lies {nearest:.1f} to {farthest:.1f} mm in front of the camera"
+    if farthest <= 0:
+        return "the part is behind the camera; check the sign of the pose (+z is to the camera)"
+    if farthest < camera.near_mm:
+        return f"{where}, before its near plane at {camera.near_mm:g} mm; move the camera away"
+    if nearest > camera.far_mm:
+        return f"{where}, beyond its far plane at {camera.far_mm:g} mm; move the camera closer"
+    if not windows:
+        return f"{where}, outside its field of view; point the camera at the part's center"
+    return (
+        f"{where}, but no pixel's ray meets it between the clip planes at {camera.near_mm:g} and "
+        f"{camera.far_mm:g} mm; it may be too small for {camera.width} x {camera.height} pixels"
+    )

@@ -1,0 +1,388 @@
+"""What of a scan is the part, what the table, and what anything else.
+
+Planes first: one is a table if the part has no face as large and the rest of the scan stands on
+one side of it, the sensor's. What remains falls into clusters; the part is the one whose size is
+likest to the part's, with all other pieces that do not make it larger than the part. What touches
+the part, such as a clamp or a chip that lies on it, is one cluster with it and stays.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import enum
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
+
+from vanejax.cad.part import Part
+from vanejax.errors import InputError
+from vanejax.scans.viewpoint import sampled_rows
+from vanejax.scans.voxels import Voxels
+
+VOXELS_PER_RADIUS = 60.0
+POINTS_PER_VOXEL = 3.0  # fewer, and a surface falls apart into its points
+MOST_GROWTHS = 12
+PLANES_TRIED = 3
+TRIPLETS = 600
+TRIPLET_POINTS = 3_000
+# of the part's radius: what a plane is sought with, and the bounds of what it is taken away with
+PLANE_REACH, LEAST_THICKNESS, MOST_THICKNESS = 0.01, 0.004, 0.12
+THICKNESS_SIGMAS, THICKNESS_POINTS = 4.0, 50_000
+# a plane of the part is not wider than the part, nor larger than its largest flat face
+WIDER, LARGER = 1.1, 1.5
+BEHIND_SHARE = 0.05  # of what is not the table, what may lie behind it: strays, its own edge
+LARGER_PART = 1.03  # how much wider than the part its pieces together may be
+NOISE = 0.02  # and by how much of its radius
+LEAST_PIECE = 0.02  # of the largest piece: smaller ones that stand on the table are chips on it
+MOST_PIECES = 9  # of which all sets are tried
+DIRECTIONS = 128  # in which widths are measured
+PART_TURNS = 12  # of the part against those
+
+
+class Segment(enum.IntEnum):
+    """What a point was taken for."""
+
+    PART = 0
+    TABLE = 1
+    OTHER = 2
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Plane:
+    """Points x with ``normal @ x = offset_mm``.
+
+    Attributes:
+      normal: [3] f64, unit, towards what stands on it.
+      offset_mm: along it.
+      thickness_mm: points nearer than this were taken for the table.
+    """
+
+    normal: np.ndarray
+    offset_mm: float
+    thickness_mm: float
+
+    def height_mm(self, points: np.ndarray) -> np.ndarray:
+        """[N] f64 of points [N, 3], mm: above the plane."""
+        return points @ self.normal - self.offset_mm
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Segments:
+    """A scan of N points, taken apart.
+
+    Attributes:
+      label: [N] u8, a `Segment` each.
+      tables: the planes that were taken away.
+    """
+
+    label: np.ndarray
+    tables: tuple[Plane, ...]
+
+    @property
+    def part(self) -> np.ndarray:
+        """[N] bool: the part, and what touches it."""
+        return self.label == Segment.PART
+
+    def count(self, segment: Segment) -> int:
+        """How many points were taken for that."""
+        return int(np.count_nonzero(self.label == segment))
+
+
+def is_larger(points: np.ndarray, part: Part) -> bool:
+    """Whether points [N, 3] mm, but for 1 % at either end, are wider than the part can be.
+
+    Then they are not of the part alone; where they are not, there may still be other things.
+    """
+    some = points[sampled_rows(len(points), 2_000)]
+    low, high = np.quantile(some @ _directions().T, [0.01, 0.99], axis=0)
+    return bool(np.any(np.sort(high - low) > _allowed_mm(_part_widths(part), part)))
+
+
+def segment(
+    points: np.ndarray, part: Part, *, sensor_origin: np.ndarray | None = None, seed: int = 0
+) -> Segments:
+    """Finds the part among other things; where there are none, everything is the part.
+
+    Args:
+      points: [N, 3] f64, mm, finite, in any frame.
+      part: whose size tells what may be it.
+      sensor_origin: [3] mm, in the same frame; None if unknown. A table has the sensor above it.
+      seed: of the planes tried: same seed, same result.
+
+    Raises:
+      InputError: points of another shape.
+    """
+    points = np.asarray(points, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise InputError(f"segmentation needs [N, 3] points in mm, got {list(points.shape)}")
+    voxels = _voxels(points, part)
+    tables = _tables(voxels, part, sensor_origin, seed)
+    label = np.full(len(points), Segment.PART, np.uint8)
+    some = points[sampled_rows(len(points), THICKNESS_POINTS)]
+    tables = tuple(_with_thickness(table, some, part) for table in tables)
+    for table in tables:
+        label[np.abs(table.height_mm(points)) <= table.thickness_mm] = Segment.TABLE
+    rest = np.flatnonzero(label == Segment.PART)
+    if len(rest):
+        mine = _part_of(points[rest], part, voxels.size_mm, tables, sensor_origin)
+        label[rest[~mine]] = Segment.OTHER
+    return Segments(label, tables)
+
+
+def _voxels(points: np.ndarray, part: Part) -> Voxels:
+    """Fine beside the part, coarse beside the points' spacing."""
+    # a stray far away would need a grid beyond 64 bits
+    widest = max(float(np.ptp(points[:, k])) for k in range(3))
+    size = max(part.radius / VOXELS_PER_RADIUS, widest / 2**20)
+    for _ in range(MOST_GROWTHS):
+        voxels = Voxels.of(points, size)
+        if len(points) >= POINTS_PER_VOXEL * len(voxels):
+            break
+        size *= 1.3
+    return voxels
+
+
+def _tables(
+    voxels: Voxels, part: Part, sensor_origin: np.ndarray | None, seed: int
+) -> tuple[Plane, ...]:
+    """The planes that are none of the part's, largest first."""
+    rng = np.random.default_rng([seed, len(voxels.of_point)])
+    middle = voxels.middle
+    left, untried = np.ones(len(middle), bool), np.ones(len(middle), bool)
+    tables: list[Plane] = []
+    for _ in range(PLANES_TRIED):
+        some = middle[left & untried]
+        if len(some) < 3:
+            break
+        plane = _best_plane(some, part, rng)
+        on = np.abs(plane.height_mm(middle)) <= plane.thickness_mm
+        standing = _standing(plane, middle[left & ~on], sensor_origin)
+        if standing is not None and _is_beyond(part, plane, middle[left & on], voxels.size_mm):
+            tables.append(standing)
+            left &= ~on
+        untried &= ~on
+    return tuple(tables)
+
+
+def _best_plane(middle: np.ndarray, part: Part, rng: np.random.Generator) -> Plane:
+    """The plane through three of the points [V, 3] that most others lie on, fitted to those."""
+    some = middle[rng.integers(len(middle), size=min(TRIPLET_POINTS, len(middle)))]
+    normal, offset = _random_planes(middle, rng)
+    on = np.count_nonzero(np.abs(some @ normal.T - offset) <= PLANE_REACH * part.radius, axis=0)
+    best = int(np.argmax(on))
+    plane = Plane(normal[best], float(offset[best]), 2 * PLANE_REACH * part.radius)
+    for _ in range(3):
+        near = middle[np.abs(plane.height_mm(middle)) <= plane.thickness_mm]
+        if len(near) < 3:
+            break
+        mean = near.mean(axis=0)
+        normal = np.linalg.eigh((near - mean).T @ (near - mean))[1][:, 0]
+        offset = float(normal @ mean)
+        height = np.abs(middle @ normal - offset)
+        close = height[height <= 2 * plane.thickness_mm]
+        sigma = 1.4826 * float(np.median(close)) if len(close) else 0.0
+        plane = Plane(normal, offset, _thickness_mm(sigma, part))
+    return plane
+
+
+def _with_thickness(plane: Plane, points: np.ndarray, part: Part) -> Plane:
+    """As thick as the noise of the points [N, 3]; the means of voxels have less."""
+    height = np.abs(plane.height_mm(points))
+    thickness = 2 * PLANE_REACH * part.radius
+    for _ in range(3):
+        sigma = 1.4826 * float(np.median(height[height <= 2 * thickness]))
+        thickness = _thickness_mm(sigma, part)
+    return dataclasses.replace(plane, thickness_mm=thickness)
+
+
+def _thickness_mm(sigma_mm: float, part: Part) -> float:
+    least, most = LEAST_THICKNESS * part.radius, MOST_THICKNESS * part.radius
+    return float(np.clip(THICKNESS_SIGMAS * sigma_mm, least, most))
+
+
+def _random_planes(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals [T, 3] and offsets [T], mm, of planes through three of the points [V, 3]."""
+    a, b, c = points[rng.integers(len(points), size=(3, TRIPLETS))]
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    # three points on a line fix no plane
+    normal, a = normal[length > 0] / length[length > 0, None], a[length > 0]
+    return normal, np.einsum("ni,ni->n", normal, a)
+
+
+def _standing(plane: Plane, others: np.ndarray, sensor_origin: np.ndarray | None) -> Plane | None:
+    """The plane with its normal to the side on which all else stands; None if there is none."""
+    if not len(others):
+        return None
+    above = float(np.mean(plane.height_mm(others) > 0))
+    if min(above, 1 - above) > BEHIND_SHARE:
+        return None
+    if above < 0.5:
+        plane = Plane(-plane.normal, -plane.offset_mm, plane.thickness_mm)
+    if sensor_origin is not None and plane.height_mm(np.asarray(sensor_origin)[None])[0] <= 0:
+        return None
+    return plane
+
+
+def _is_beyond(part: Part, plane: Plane, on: np.ndarray, size_mm: float) -> bool:
+    """Whether a connected patch of the plane, points [V, 3], is more than any face of the part."""
+    axes = np.linalg.svd(plane.normal[None])[2][1:]
+    cell_mm = 3 * size_mm
+    cell = np.floor(on @ axes.T / cell_mm).astype(np.int64)
+    cell -= cell.min(axis=0)
+    # of the table, which is millions of cells only where a stray lies far away in the plane
+    cell = cell[(cell < 4096).all(axis=1)]
+    image = np.zeros(cell.max(axis=0) + 1, bool)
+    image[cell[:, 0], cell[:, 1]] = True
+    patch, _ = ndimage.label(image, np.ones((3, 3)))
+    largest = np.argwhere(patch == 1 + np.argmax(np.bincount(patch[image])[1:]))
+    angle = np.radians(np.arange(0, 180, 5))
+    across = largest @ np.stack([np.cos(angle), np.sin(angle)])
+    width = cell_mm * float(np.ptp(across, axis=0).max())
+    if width > WIDER * 2 * part.radius:
+        return True
+    area = len(largest) * cell_mm**2 - 4 * cell_mm * width  # less a cell all around
+    return area > LARGER * largest_slab_mm2(part, 2 * plane.thickness_mm)
+
+
+def largest_slab_mm2(part: Part, thickness_mm: float, *, seed: int = 0) -> float:
+    """Area of the part's surface that lies within a thickness of one plane, the most there is.
+
+    Of both sides and of curved surface too: a table must be larger than what any view could take
+    for one.
+    """
+    some = part.sample(4_000, seed)[0]
+    normal, offset = _random_planes(some, np.random.default_rng(seed))
+    on = np.abs(some @ normal.T - offset) <= thickness_mm
+    return float(part.triangles.areas().sum() * np.mean(on, axis=0).max())
+
+
+def _part_of(
+    points: np.ndarray,
+    part: Part,
+    size_mm: float,
+    tables: tuple[Plane, ...],
+    sensor_origin: np.ndarray | None,
+) -> np.ndarray:
+    """[N] bool: which of the points [N, 3] are the part, or cannot be told from it."""
+    voxels = Voxels.of(points, size_mm)
+    directions, wanted = _directions(), _part_widths(part)
+    piece = voxels.clusters()
+    supports = _Supports.of(voxels.middle, piece, directions)
+    allowed = _allowed_mm(wanted, part)
+    too_large = np.any(supports.widths() > allowed, axis=1)
+    if sensor_origin is not None and too_large.any():
+        # what is larger than the part is more than the part
+        least = max(1, int(LEAST_PIECE * len(voxels)))
+        folded = voxels.pieces(np.asarray(sensor_origin, np.float64), least=least)
+        parted = too_large[piece]
+        piece[parted] = piece.max() + 1 + folded[parted]
+        piece = np.unique(piece, return_inverse=True)[1]
+        supports = _Supports.of(voxels.middle, piece, directions)
+    order = np.argsort(-supports.count, kind="stable")
+    large = order[: np.count_nonzero(supports.count >= LEAST_PIECE * supports.count[order[0]])]
+    chosen = _likeliest(supports, large[:MOST_PIECES], wanted, allowed)
+    mine = supports.together(chosen)
+    small = np.setdiff1d(order, large)
+    fits = np.all(supports.widths(mine)[small] <= np.maximum(allowed, mine.widths()), 1)
+    if tables:
+        height = np.min(
+            [table.height_mm(voxels.middle) - table.thickness_mm for table in tables], 0
+        )
+        lowest = np.full(len(order), np.inf)
+        np.minimum.at(lowest, piece, height)
+        fits &= lowest[small] > 2 * size_mm
+    return np.isin(piece, np.concatenate([chosen, small[fits]]))[voxels.of_point]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Supports:
+    """How far K pieces reach in D directions.
+
+    Attributes:
+      low, high: [K, D] f64, mm.
+      count: [K] i64, voxels in each.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    count: np.ndarray
+
+    @classmethod
+    def of(cls, middle: np.ndarray, piece: np.ndarray, directions: np.ndarray) -> _Supports:
+        """Of voxels [V, 3] mm by the number [V] of their piece; no number is left out."""
+        count = np.bincount(piece)
+        along = (middle @ directions.T)[np.argsort(piece, kind="stable")]
+        first = np.cumsum(count) - count
+        return cls(np.minimum.reduceat(along, first), np.maximum.reduceat(along, first), count)
+
+    def together(self, which: np.ndarray) -> _Supports:
+        """Pieces as one."""
+        return _Supports(
+            self.low[which].min(axis=0, keepdims=True),
+            self.high[which].max(axis=0, keepdims=True),
+            self.count[which].sum(keepdims=True),
+        )
+
+    def widths(self, other: _Supports | None = None) -> np.ndarray:
+        """[K, D] mm, ascending, of each piece, or of each with one other.
+
+        Whatever is a piece of the part is, in every order statistic, at most as wide as the part,
+        however it is turned.
+        """
+        low, high = self.low, self.high
+        if other is not None:
+            low, high = np.minimum(low, other.low), np.maximum(high, other.high)
+        return np.sort(high - low, axis=1)
+
+
+def _likeliest(
+    supports: _Supports, large: np.ndarray, wanted: np.ndarray, allowed: np.ndarray
+) -> np.ndarray:
+    """Which of the large pieces together are most of the part, but no more than it.
+
+    All sets of them are tried: the score is the number of voxels times how like the widths are to
+    the part's. A single piece that is too large is better than nothing.
+    """
+    chosen = (np.arange(1, 1 << len(large))[:, None] >> np.arange(len(large))) & 1 == 1
+    low = np.where(chosen[..., None], supports.low[large], np.inf).min(axis=1)
+    high = np.where(chosen[..., None], supports.high[large], -np.inf).max(axis=1)
+    widths = np.sort(high - low, axis=1)
+    ratio = widths / wanted
+    like = np.minimum(ratio, 1 / np.maximum(ratio, 1e-9)).mean(axis=1)
+    score = like * (chosen @ supports.count[large])
+    fits = np.all(widths <= allowed, axis=1)
+    if not fits.any():
+        fits = chosen.sum(axis=1) == 1
+        score = like
+    return large[chosen[np.argmax(np.where(fits, score, -1.0))]]
+
+
+def _allowed_mm(widths: np.ndarray, part: Part) -> np.ndarray:
+    """What a piece of the part may be wide: noise makes thin things thicker."""
+    return LARGER_PART * widths + NOISE * part.radius
+
+
+def _part_widths(part: Part) -> np.ndarray:
+    """[D] f64, mm, ascending: the largest that order statistics of the part's widths can be.
+
+    They depend a little on how it is turned against the directions.
+    """
+    vertices = np.asarray(part.mesh.vertices)
+    with contextlib.suppress(QhullError):  # a flat part has no hull; only corners count anyway
+        vertices = vertices[ConvexHull(vertices).vertices]
+    turns = Rotation.random(PART_TURNS, rng=np.random.default_rng(0)).as_matrix()
+    widths = [np.ptp(vertices @ turn @ _directions().T, axis=0) for turn in turns]
+    return np.sort(widths, axis=1).max(axis=0)
+
+
+def _directions() -> np.ndarray:
+    """[D, 3] f64, unit, even over half the sphere: a spiral of equal areas."""
+    k = np.arange(DIRECTIONS) + 0.5
+    z = k / DIRECTIONS
+    angle = np.pi * (1 + np.sqrt(5)) * k
+    across = np.sqrt(1 - z**2)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)

@@ -1,0 +1,110 @@
+"""Checkpoints of a training state: atomic, the last few and the best."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+from orbax.checkpoint import checkpoint_managers
+
+from vanejax.errors import InputError
+from vanejax.training.train_step import TrainState, Variables
+
+
+class Checkpoints:
+    """The checkpoints in a folder; each is written whole or not at all (orbax renames it).
+
+    Kept are the ``keep`` latest and the one with the lowest ``score``. Use as a context manager.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], *, keep: int = 2) -> None:
+        policy = checkpoint_managers.AnyPreservationPolicy(
+            [
+                checkpoint_managers.LatestN(keep),
+                checkpoint_managers.BestN(
+                    get_metric_fn=_negative_score, n=1, keep_checkpoints_without_metrics=False
+                ),
+            ]
+        )
+        self._manager = ocp.CheckpointManager(
+            Path(folder).absolute(),
+            options=ocp.CheckpointManagerOptions(
+                preservation_policy=policy,
+                best_fn=_negative_score,
+                best_mode="max",
+                enable_async_checkpointing=False,
+            ),
+        )
+
+    def __enter__(self) -> Checkpoints:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._manager.close()
+
+    @property
+    def latest_step(self) -> int | None:
+        """Step of the newest checkpoint, None if there is none."""
+        return self._manager.latest_step()
+
+    @property
+    def best_step(self) -> int | None:
+        """Step of the checkpoint with the lowest score, None if none has a score."""
+        return self._manager.best_step()
+
+    def save(self, state: TrainState, *, score: float | None = None) -> None:
+        """Writes the state under its step; does nothing where that step is there already.
+
+        Args:
+          score: what the best checkpoint is chosen by, lower is better; None if not measured.
+        """
+        step = int(state.step)
+        if step in self._manager.all_steps():
+            return
+        metrics = None if score is None else {"score": float(score)}
+        self._manager.save(step, args=ocp.args.StandardSave(state), metrics=metrics)
+        self._manager.wait_until_finished()
+
+    def restore(self, like: TrainState, *, step: int | None = None) -> TrainState:
+        """Reads a state; the latest one by default.
+
+        Args:
+          like: a state with the wanted structure, shapes and dtypes, such as `init_state` gives.
+
+        Raises:
+          InputError: no checkpoint, one that cannot be read, or one of another model.
+        """
+        step = self.latest_step if step is None else step
+        if step is None:
+            raise InputError(f"{self._manager.directory}: no checkpoint; train first")
+        abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+        try:
+            return self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
+        except (ValueError, KeyError, TypeError, OSError) as error:
+            raise InputError(
+                f"{self._manager.directory}/{step}: cannot be read as a state of this model; "
+                f"was it trained with another config? ({_first_line(error)})"
+            ) from error
+
+
+def restore_or(folder: str | os.PathLike[str], fresh: TrainState, *, keep: int) -> TrainState:
+    """The latest state in ``folder``, or ``fresh`` where there is none."""
+    with Checkpoints(folder, keep=keep) as checkpoints:
+        return fresh if checkpoints.latest_step is None else checkpoints.restore(fresh)
+
+
+def all_finite(variables: Variables) -> bool:
+    """Whether every number of a tree of arrays is finite."""
+    return all(bool(np.isfinite(np.asarray(leaf)).all()) for leaf in jax.tree.leaves(variables))
+
+
+def _negative_score(metrics: dict[str, Any]) -> float:
+    return -float(metrics["score"])
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().split("\n")[0][:200]

@@ -1,0 +1,273 @@
+"""The virtual dataset: thinned scans of one part from many views, in memory and on disk."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vanejax.cad.part import Part
+from vanejax.errors import InputError
+from vanejax.files import read_stored_arrays
+from vanejax.pointcloud import voxel_thin
+from vanejax.rigid import RigidTransform
+from vanejax.scanner.camera import Camera, Viewpoints
+from vanejax.scanner.virtual_scanner import Scan, scan_views
+
+FORMAT = "vanejax scan set"
+VERSION = 1
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ScanSet:
+    """Thinned scans of a part with their labels, and the thinned CAD surface they belong to.
+
+    Attributes:
+      points: [V, P, 3] f32, mm, camera frame; rows past ``counts`` are zero.
+      normals: [V, P, 3] f32, unit, camera frame.
+      counts: [V] i32, real rows of each view: the paper's X.
+      viewpoints: V poses camera_from_part with their elevation and azimuth.
+      reference_points: [Y, 3] f32, mm, part frame.
+      reference_normals: [Y, 3] f32, unit, outward.
+      center: [3] f64, mm, part frame, and ``radius_mm``: the unit sphere, from the CAD alone.
+      source: what it was made from: part name and hash, camera, voxel size, units.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    counts: np.ndarray
+    viewpoints: Viewpoints
+    reference_points: np.ndarray
+    reference_normals: np.ndarray
+    center: np.ndarray
+    radius_mm: float
+    source: Mapping[str, Any]
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    @property
+    def visible_fraction(self) -> np.ndarray:
+        """[V] f64: X / Y, the share of the part's surface that the view sees."""
+        return self.counts / len(self.reference_points)
+
+    def select(self, which: np.ndarray) -> ScanSet:
+        """The views at the indices or [V] bool mask ``which``."""
+        return dataclasses.replace(
+            self,
+            points=self.points[which],
+            normals=self.normals[which],
+            counts=self.counts[which],
+            viewpoints=self.viewpoints.select(which),
+        )
+
+    @property
+    def train(self) -> ScanSet:
+        """The training views of the paper: 162 of 216."""
+        return self.select(~self.viewpoints.is_test)
+
+    @property
+    def test(self) -> ScanSet:
+        """The test views of the paper: 54 of 216."""
+        return self.select(self.viewpoints.is_test)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes an .npz with a checksum; it appears complete or not at all."""
+        arrays = self._arrays()
+        header = {
+            "format": FORMAT,
+            "version": VERSION,
+            "radius_mm": self.radius_mm,
+            "source": dict(self.source),
+            "sha256": _digest(arrays),
+        }
+        text = np.frombuffer(json.dumps(header, sort_keys=True).encode(), np.uint8)
+        path = Path(path)
+        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        try:
+            with open(partial, "wb") as file:
+                np.savez(file, header=text, **arrays)
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        poses = self.viewpoints.camera_from_part
+        return {
+            "points": self.points,
+            "normals": self.normals,
+            "counts": self.counts,
+            "elevation_deg": self.viewpoints.elevation_deg,
+            "azimuth_deg": self.viewpoints.azimuth_deg,
+            "camera_from_part": poses.as_matrix(),
+            "reference_points": self.reference_points,
+            "reference_normals": self.reference_normals,
+            "center": self.center,
+        }
+
+
+def describe_source(part: Part, camera: Camera, viewpoints: Viewpoints, voxel_mm: float) -> dict:
+    """What a scan set of these is made from: two that agree hold the same scans."""
+    poses = np.ascontiguousarray(viewpoints.camera_from_part.as_matrix(), "<f8")
+    return {
+        "part": part.name,
+        "part_sha256": part.sha256,
+        "camera": camera.to_dict(),
+        "viewpoints_sha256": hashlib.sha256(poses.tobytes()).hexdigest(),
+        "voxel_mm": voxel_mm,
+        "units": "mm",
+    }
+
+
+def make_scan_set(
+    part: Part,
+    camera: Camera,
+    viewpoints: Viewpoints,
+    *,
+    voxel_mm: float = 1.5,
+    progress: bool = True,
+) -> ScanSet:
+    """Scans a part from every viewpoint and thins scans and CAD surface alike.
+
+    Args:
+      part, camera, viewpoints: what is seen, by what, from where.
+      voxel_mm: one point per voxel is kept; it must be several times the pixel spacing, so that
+        scans and CAD surface end up equally dense and X / Y is the visible share.
+      progress: whether to show a progress bar.
+
+    Raises:
+      InputError: a view that does not see the part, or a voxel that leaves too few points.
+    """
+    if not voxel_mm > 0:
+        raise InputError(f"voxel_mm must be positive, got {voxel_mm}")
+
+    def thin(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
+        kept = voxel_thin(scan.points, voxel_mm=voxel_mm)
+        return scan.points[kept], scan.normals[kept]
+
+    scans = scan_views(part, camera, viewpoints, transform=thin, progress=progress)
+    counts = np.array([len(points) for points, _ in scans], np.int32)
+    points, normals = np.zeros((2, len(scans), counts.max(), 3), np.float32)
+    for view, (xyz, normal) in enumerate(scans):
+        points[view, : len(xyz)] = xyz
+        normals[view, : len(xyz)] = normal
+
+    # about 16 samples for each voxel that the surface crosses: hardly one is missed
+    drawn = int(np.clip(16 * part.triangles.areas().sum() / voxel_mm**2, 1_000, 4_000_000))
+    surface, outward, _ = part.sample(drawn, seed=0)
+    kept = voxel_thin(surface, voxel_mm=voxel_mm)
+    if len(kept) < 64:
+        raise InputError(
+            f"voxel_mm={voxel_mm} leaves {len(kept)} points of the whole part "
+            f"({part.extent_mm.max():.3g} mm large); take a smaller voxel"
+        )
+    return ScanSet(
+        points=points,
+        normals=normals,
+        counts=counts,
+        viewpoints=viewpoints,
+        reference_points=surface[kept].astype(np.float32),
+        reference_normals=outward[kept].astype(np.float32),
+        center=part.center,
+        radius_mm=part.radius,
+        source=describe_source(part, camera, viewpoints, voxel_mm),
+    )
+
+
+def load_scan_set(
+    path: str | os.PathLike[str], *, expected: Mapping[str, Any] | None = None
+) -> ScanSet:
+    """Reads what `ScanSet.save` wrote; nothing in the file is unpickled or trusted.
+
+    Args:
+      path: the .npz file.
+      expected: as `describe_source` gives it; the file must have been made from the same.
+
+    Raises:
+      InputError: no such file, not a scan set, another version, truncated, changed, or stale.
+    """
+    path = Path(path)
+    try:
+        arrays = read_stored_arrays(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: truncated or not a scan set ({error}); delete it and scan again"
+        ) from error
+    header = _read_header(arrays.pop("header", None), path)
+    if header["sha256"] != _digest(arrays):
+        raise InputError(f"{path}: its checksum is wrong; delete it and scan again")
+    for key, value in (expected or {}).items():
+        if header["source"].get(key) != value:
+            raise InputError(
+                f"{path}: stale: made with {key} = {header['source'].get(key)}, wanted {value}; "
+                "delete it or choose another folder"
+            )
+    return _from_arrays(arrays, header, path)
+
+
+def _read_header(raw: np.ndarray | None, path: Path) -> dict[str, Any]:
+    try:
+        header = json.loads(bytes(raw)) if raw is not None else None
+    except ValueError:
+        header = None
+    wanted = {"format", "version", "radius_mm", "source", "sha256"}
+    if not isinstance(header, dict) or not wanted <= set(header) or header["format"] != FORMAT:
+        raise InputError(f"{path}: not a scan set of vanejax")
+    if header["version"] != VERSION:
+        raise InputError(
+            f"{path}: scan set version {header['version']}, this program reads {VERSION}; "
+            "delete it and scan again"
+        )
+    return header
+
+
+def _from_arrays(arrays: dict[str, np.ndarray], header: dict[str, Any], path: Path) -> ScanSet:
+    try:
+        viewpoints = Viewpoints(
+            elevation_deg=arrays["elevation_deg"],
+            azimuth_deg=arrays["azimuth_deg"],
+            camera_from_part=RigidTransform.from_matrix(arrays["camera_from_part"]),
+        )
+        scans = ScanSet(
+            points=arrays["points"],
+            normals=arrays["normals"],
+            counts=arrays["counts"],
+            viewpoints=viewpoints,
+            reference_points=arrays["reference_points"],
+            reference_normals=arrays["reference_normals"],
+            center=arrays["center"],
+            radius_mm=float(header["radius_mm"]),
+            source=header["source"],
+        )
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputError(f"{path}: not a whole scan set ({error})") from error
+    views = len(scans.counts)
+    consistent = (
+        scans.points.ndim == 3
+        and scans.points.shape == scans.normals.shape
+        and len(scans.points) == len(viewpoints) == len(viewpoints.azimuth_deg) == views
+        and arrays["camera_from_part"].shape == (views, 4, 4)
+        and scans.reference_points.shape == scans.reference_normals.shape
+        and scans.counts.min(initial=1) >= 1
+        and scans.counts.max(initial=1) <= scans.points.shape[1]
+    )
+    if not consistent:
+        raise InputError(f"{path}: the shapes of its arrays do not fit together")
+    return scans
+
+
+def _digest(arrays: Mapping[str, np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        value = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {value.dtype.str} {value.shape}".encode())
+        digest.update(value.data if value.size else b"")
+    return digest.hexdigest()

@@ -1,0 +1,155 @@
+"""From the work folder of a training run to one file of weights."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+from vanejax.errors import InputError
+from vanejax.matching.rpmnet import RpmNet
+from vanejax.scanner.camera import Camera
+from vanejax.training.checkpoint import Checkpoints
+from vanejax.training.dataset import ScanSet, load_scan_set
+from vanejax.training.pairs import Drawing, source_sizes
+from vanejax.training.train_step import TrainState, make_optimizer
+from vanejax.training.weight_file import (
+    TrainedMatcher,
+    abstract_variables,
+    model_from_dict,
+    save_model,
+)
+
+Which = Literal["best", "last"]
+
+
+def export_workdir(
+    workdir: str | os.PathLike[str], path: str | os.PathLike[str], *, checkpoint: Which = "best"
+) -> TrainedMatcher:
+    """Writes the weights of a training run with all that inference needs.
+
+    Args:
+      workdir: as ``experiments.train`` left it: run.json, scans.npz and checkpoints/. It is only
+        read, so a run that still goes on may be exported.
+      path: the file to write, .npz.
+      checkpoint: the one with the smallest error on the validation pairs, or the newest.
+
+    Returns:
+      What was written.
+
+    Raises:
+      InputError: the folder holds no such run, its pieces do not fit together, or the file cannot
+        be written.
+    """
+    workdir = Path(workdir)
+    if not workdir.is_dir():
+        raise InputError(f"{workdir}: no such folder; give the work folder of a training run")
+    record = workdir / "run.json"
+    run = _read_run(record)
+    scans = load_scan_set(workdir / "scans.npz")
+    hashes = run["part"]["sha256"], str(scans.source.get("part_sha256"))
+    if hashes[0] != hashes[1]:
+        raise InputError(
+            f"{workdir}: run.json is about the part {hashes[0][:12]}, scans.npz about "
+            f"{hashes[1][:12]}: the folder mixes two runs"
+        )
+    try:
+        config = run["config"]
+        settings = dict(config["model"])
+        iterations = settings.pop("test_iterations")
+        name = settings.pop("name", "rpmnet")  # runs of older versions are all RPM-Net's
+        if name != "rpmnet":
+            raise InputError(
+                f"{workdir} is a run of {name!r}: register takes the weights of an RPM-Net"
+            )
+        model = model_from_dict(settings, str(record))
+        drawing = _drawing(config["data"], scans)
+        voxel_mm = config["data"]["voxel_mm"]
+        camera = Camera.from_dict(scans.source["camera"])
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"{workdir}: run.json or scans.npz has no {error}; another version wrote it"
+        ) from error
+    variables, step = _read_weights(workdir, model, checkpoint)
+    matcher = TrainedMatcher(
+        model=model,
+        variables=variables,
+        iterations=iterations,
+        drawing=drawing,
+        voxel_mm=voxel_mm,
+        center=scans.center,
+        radius_mm=scans.radius_mm,
+        reference_points=scans.reference_points,
+        reference_normals=scans.reference_normals,
+        part_name=run["part"]["name"],
+        part_sha256=run["part"]["sha256"],
+        camera=camera,
+        trained={"step": step, "checkpoint": checkpoint}
+        | {name: run.get(name) for name in ("versions", "commit", "started")}
+        | {"experiment": config.get("name"), "seed": config.get("seed"), "config": config}
+        | {"evaluation": _evaluation(workdir / "evaluation.json")},
+    )
+    save_model(path, matcher)
+    return matcher
+
+
+def _evaluation(path: Path) -> dict[str, Any] | None:
+    """The run's own figures on its test views; None before it was evaluated."""
+    if not path.exists():
+        return None
+    found = _read_json(path)
+    return {name: found[name] for name in ("views", "summary", "date") if name in found}
+
+
+def _drawing(data: dict[str, Any], scans: ScanSet) -> Drawing:
+    names = ("num_reference", "noise", "noise_clip", "max_rotation_deg", "max_translation")
+    settings = {name: data[name] for name in names}
+    # the rows of a source fit the view that sees most, as in training
+    rows = int(source_sizes(scans, settings["num_reference"]).max())
+    return Drawing(num_source=rows, **settings)
+
+
+def _read_weights(workdir: Path, model: RpmNet, checkpoint: Which) -> tuple[Any, int]:
+    """The averaged weights as numpy arrays, and the step that they are of."""
+    folder = workdir / "checkpoints"
+    if not folder.is_dir():
+        raise InputError(f"{workdir}: holds no checkpoints; train first")
+    variables = abstract_variables(model)
+    # only its structure counts, which no number changes
+    optimizer = make_optimizer(learning_rate=1.0, steps=1, warmup_steps=0, clip_norm=1.0)
+    like = TrainState(
+        step=jax.ShapeDtypeStruct((), np.int32),
+        variables=variables,
+        average=variables,
+        opt_state=jax.eval_shape(optimizer.init, variables),
+    )
+    with Checkpoints(folder) as checkpoints:
+        steps = {"best": checkpoints.best_step, "last": checkpoints.latest_step}
+        step = steps[checkpoint]
+        if step is None and checkpoint == "best" and steps["last"] is not None:
+            raise InputError(f"{folder}: none was validated yet; take the last checkpoint")
+        state = checkpoints.restore(like, step=step)
+    return jax.tree.map(np.asarray, state.average), int(state.step)
+
+
+def _read_run(path: Path) -> dict[str, Any]:
+    run = _read_json(path)
+    part = run.get("part")
+    known = isinstance(part, dict) and all(isinstance(part.get(n), str) for n in ("name", "sha256"))
+    if not known or not isinstance(run.get("config"), dict):
+        raise InputError(f"{path}: does not say which config and part the run is of")
+    return run
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {path.parent} is no training run") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,184 @@
+"""Scans without end: every training step gets new ones, from anywhere, by another camera.
+
+Scan number n is made from ``default_rng([seed, n])`` alone: viewpoint, distance, roll, sensor and
+casting. Step s takes the scans ``B s`` to ``B s + B - 1``, so that a run can begin at any step and
+see what an unbroken one sees. Worker threads scan ahead of the training, which never waits as long
+as they are faster than it is (tens of milliseconds for a scan of 320 x 256 pixels).
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+
+import jax.numpy as jnp
+import numpy as np
+
+from vanejax.cad.part import Part
+from vanejax.errors import InputError
+from vanejax.pointcloud import PointCloud, voxel_thin
+from vanejax.rigid import RigidTransform
+from vanejax.scanner.camera import look_at
+from vanejax.scanner.measurement import measure
+from vanejax.scanner.sensor import Sensor
+from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scans.normals import estimate_normals
+from vanejax.training.pairs import ScanBank
+
+# more than a log interval: the loop runs ahead of the device between two looks at its metrics
+STEPS_AHEAD = 16
+LEAST_POINTS = 32
+ATTEMPTS = 20
+_AHEAD_OF_VALIDATION = 1 << 40  # scan numbers that no training reaches
+
+
+@dataclasses.dataclass(frozen=True)
+class RandomViews:
+    """From where a part is seen: uniform in each of these.
+
+    Attributes:
+      distance_mm: (least, most) from the camera to the part's centre.
+      elevation_deg: (least, most) above the part's xy plane; directions are uniform on that zone
+        of the sphere.
+      roll_deg: the camera turns about its axis by up to this, either way; the projector with it.
+      aside: the part's centre is off the optical axis by up to this share of the distance, in x and
+        in y.
+
+    Raises:
+      InputError: ranges that hold nothing.
+    """
+
+    distance_mm: tuple[float, float] = (300.0, 500.0)
+    elevation_deg: tuple[float, float] = (40.0, 90.0)
+    roll_deg: float = 180.0
+    aside: float = 0.04
+
+    def __post_init__(self) -> None:
+        near, far = self.distance_mm
+        low, high = self.elevation_deg
+        if not 0 < near <= far < np.inf:
+            raise InputError(f"distance_mm={self.distance_mm!r} must be (least, most), in mm")
+        if not -90 <= low <= high <= 90:
+            raise InputError(
+                f"elevation_deg={self.elevation_deg!r} must be (least, most) within -90 and 90"
+            )
+
+    def draw(self, rng: np.random.Generator, center: np.ndarray) -> RigidTransform:
+        """camera_from_part, [3, 3] and [3] mm, of a part with this ``center`` [3] mm."""
+        low, high = np.sin(np.radians(self.elevation_deg))
+        height, azimuth = rng.uniform(low, high), rng.uniform(0, 2 * np.pi)
+        flat = np.sqrt(1 - height**2)
+        outward = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), height])
+        distance = rng.uniform(*self.distance_mm)
+        roll = np.radians(rng.uniform(-self.roll_deg, self.roll_deg))
+        sideways = np.append(rng.uniform(-self.aside, self.aside, 2) * distance, 0.0)
+        turn = np.eye(3)
+        turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
+        return RigidTransform(turn, sideways) @ look_at(center + distance * outward, center)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ScanStream:
+    """Random scans of a part as training takes them.
+
+    Attributes:
+      part: the CAD model: frame, centre and radius.
+      reference: [Y] its thinned surface on the device, unit-sphere units.
+      sensor: each scan is by `Sensor.another` one of this kind.
+      views: from where.
+      castings: scanners of the parts that are scanned, by turns: the CAD model's own, or castings
+        that differ from it.
+      batch_size: B, scans in a step.
+      num_reference, num_source: M points of the reference and rows N of a source, as in
+        `vanejax.training.pairs.Drawing`; a scan has M X / Y points, at most N.
+      voxel_mm: thinning, as that of the reference.
+      seed: of everything.
+    """
+
+    part: Part
+    reference: PointCloud
+    sensor: Sensor
+    views: RandomViews
+    castings: Sequence[Scanner]
+    batch_size: int
+    num_reference: int
+    num_source: int
+    voxel_mm: float
+    seed: int
+
+    def scan(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Points and normals [n, 3] f32 of one scan, part frame, unit-sphere units; n <= N.
+
+        Normals are estimated from the measured points, as those of a real scan are.
+
+        Raises:
+          InputError: `ATTEMPTS` random views in a row see next to nothing of the part.
+        """
+        rng = np.random.default_rng([self.seed, number])
+        scanner = self.castings[int(rng.integers(len(self.castings)))]
+        for _ in range(ATTEMPTS):
+            camera_from_part = self.views.draw(rng, self.part.center)
+            distance = float(np.linalg.norm(camera_from_part.apply(self.part.center[None])))
+            sensor = self.sensor.another(rng).exposed_for(distance)
+            try:
+                points = measure(scanner, sensor, camera_from_part, rng).points
+            except InputError:  # the part is outside the image
+                continue
+            thinned = voxel_thin(points, voxel_mm=self.voxel_mm)
+            wanted = round(self.num_reference * len(thinned) / self.reference.mask.shape[0])
+            wanted = min(wanted, self.num_source, len(thinned))
+            if wanted >= LEAST_POINTS:
+                break
+        else:
+            raise InputError(
+                f"{ATTEMPTS} random views in a row measured next to nothing of {self.part.name}; "
+                "see the distances and the sensor's light"
+            )
+        chosen = np.sort(rng.choice(thinned, wanted, replace=False))
+        normals = estimate_normals(points, sensor_origin=np.zeros(3), at=chosen)
+        part_from_camera = camera_from_part.inverse()
+        xyz = part_from_camera.apply(points[chosen].astype(np.float64)) - self.part.center
+        xyz /= self.part.radius
+        return xyz.astype(np.float32), part_from_camera.rotate(normals).astype(np.float32)
+
+    def bank(self, numbers: Sequence[int]) -> ScanBank:
+        """The scans of these numbers, [B, N], on the device."""
+        shape = (len(numbers), self.num_source, 3)
+        xyz, normals = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        sizes = np.zeros(len(numbers), np.int32)
+        for row, number in enumerate(numbers):
+            points, directions = self.scan(number)
+            sizes[row] = len(points)
+            xyz[row, : len(points)], normals[row, : len(points)] = points, directions
+        mask = np.arange(self.num_source)[None, :] < sizes[:, None]
+        scans = PointCloud(jnp.asarray(xyz), jnp.asarray(normals), jnp.asarray(mask))
+        return ScanBank(scans=scans, source_sizes=jnp.asarray(sizes), reference=self.reference)
+
+    def of_step(self, step: int) -> ScanBank:
+        """What step ``step`` trains on."""
+        return self.bank(range(step * self.batch_size, (step + 1) * self.batch_size))
+
+    def for_validation(self, count: int) -> ScanBank:
+        """``count`` scans that no step trains on."""
+        return self.bank(range(_AHEAD_OF_VALIDATION, _AHEAD_OF_VALIDATION + count))
+
+    @contextmanager
+    def steps(self, first: int, end: int, *, workers: int = 1) -> Iterator[Iterator[ScanBank]]:
+        """The banks of the steps ``first`` to ``end - 1``, made ahead in threads; a context."""
+        with ThreadPoolExecutor(workers, "scans") as pool:
+            waiting: collections.deque[Future[ScanBank]] = collections.deque()
+
+            def banks() -> Iterator[ScanBank]:
+                for step in range(first, end):
+                    while len(waiting) < STEPS_AHEAD and step + len(waiting) < end:
+                        waiting.append(pool.submit(self.of_step, step + len(waiting)))
+                    yield waiting.popleft().result()
+
+            try:
+                yield banks()
+            finally:
+                for future in waiting:
+                    future.cancel()

@@ -1,0 +1,202 @@
+"""Drawing training and test pairs from a scan set, inside a jitted step.
+
+The scans live on the device in unit-sphere units of the part; drawing a pair (subset, noise, pose)
+is JAX code driven by a key, so that the same key gives the same pair on any machine.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vanejax.errors import InputError
+from vanejax.matching.se3 import exp_so3
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+from vanejax.training.dataset import ScanSet
+
+
+@flax.struct.dataclass
+class Pair:
+    """The unit of data: two clouds in unit-sphere units and the motion between them.
+
+    Attributes:
+      source: [N] the scan, moved away from the part.
+      target: [M] the reference, sampled from the CAD part.
+      target_from_source: the label.
+    """
+
+    source: PointCloud
+    target: PointCloud
+    target_from_source: RigidTransform
+
+
+@flax.struct.dataclass
+class ScanBank:
+    """A scan set on the device: part frame, unit-sphere units.
+
+    Attributes:
+      scans: [V, P] padded clouds.
+      source_sizes: [V] i32, points to draw of each view: 1024 X / Y.
+      reference: [Y] the thinned CAD surface.
+    """
+
+    scans: PointCloud
+    source_sizes: jax.Array
+    reference: PointCloud
+
+    @property
+    def size(self) -> int:
+        """V, the number of views."""
+        return self.scans.mask.shape[0]
+
+    def draw(self, key: jax.Array, views: jax.Array, drawing: Drawing) -> Pair:
+        """`draw_pairs` of these views [B] i32."""
+        return draw_pairs(key, self, views, drawing)
+
+
+class Bank(Protocol):
+    """What pairs are drawn from: a pytree on the device."""
+
+    @property
+    def size(self) -> int:
+        """How many entries there are."""
+        ...
+
+    def draw(self, key: jax.Array, entries: jax.Array, drawing: Drawing) -> Pair:
+        """A batch from the entries [B] i32: sources [B, N] that share one target [M]."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawing:
+    """How pairs are drawn; the defaults are the paper's.
+
+    Attributes:
+      num_reference: M, points of the reference.
+      num_source: N, rows of every source, at least the largest of a bank's ``source_sizes``.
+      noise: standard deviation of the Gaussian noise on both clouds, unit-sphere units.
+      noise_clip: largest noise per coordinate, unit-sphere units (RPM-Net's jitter).
+      max_rotation_deg: the pose's rotation angle is uniform up to here, about a uniform axis.
+      max_translation: each coordinate of the translation is uniform in plus or minus this,
+        unit-sphere units.
+    """
+
+    num_reference: int = 1024
+    num_source: int = 512
+    noise: float = 0.01
+    noise_clip: float = 0.05
+    max_rotation_deg: float = 45.0
+    max_translation: float = 0.5
+
+
+def source_sizes(scan_set: ScanSet, num_reference: int) -> np.ndarray:
+    """[V] i32: 1024 X / Y with the paper's 1024 (section III.D), at least 16."""
+    wanted = np.rint(num_reference * scan_set.visible_fraction).astype(np.int32)
+    return np.minimum(np.maximum(wanted, 16), scan_set.counts)
+
+
+def make_bank(scan_set: ScanSet, *, num_reference: int) -> ScanBank:
+    """Moves scans into the part frame (float64, on the host) and onto the device as float32.
+
+    Raises:
+      InputError: the CAD surface has fewer thinned points than ``num_reference``.
+    """
+    if len(scan_set.reference_points) < num_reference:
+        raise InputError(
+            f"the thinned CAD surface has {len(scan_set.reference_points)} points, "
+            f"{num_reference} are wanted; take a smaller voxel"
+        )
+    part_from_camera = scan_set.viewpoints.camera_from_part.inverse()
+    center, radius = scan_set.center, scan_set.radius_mm
+    mask = np.arange(scan_set.points.shape[1])[None, :] < scan_set.counts[:, None]
+    xyz = (part_from_camera.apply(scan_set.points.astype(np.float64)) - center) / radius
+    normals = part_from_camera.rotate(scan_set.normals.astype(np.float64))
+    return ScanBank(
+        scans=PointCloud(
+            xyz=jnp.asarray(np.where(mask[..., None], xyz, 0.0), jnp.float32),
+            normals=jnp.asarray(np.where(mask[..., None], normals, 0.0), jnp.float32),
+            mask=jnp.asarray(mask),
+        ),
+        source_sizes=jnp.asarray(source_sizes(scan_set, num_reference)),
+        reference=PointCloud.create(
+            xyz=jnp.asarray((scan_set.reference_points - center) / radius, jnp.float32),
+            normals=jnp.asarray(scan_set.reference_normals, jnp.float32),
+        ),
+    )
+
+
+def draw_subset(key: jax.Array, cloud: PointCloud, size: jax.Array, rows: int) -> PointCloud:
+    """``size`` [] different real points of a cloud [P] in random order, padded to ``rows``."""
+    order = jax.random.uniform(key, cloud.mask.shape)
+    _, index = jax.lax.top_k(jnp.where(cloud.mask, order, -1.0), rows)
+    mask = cloud.mask[index] & (jnp.arange(rows) < size)
+    return PointCloud(
+        xyz=jnp.where(mask[:, None], cloud.xyz[index], 0.0),
+        normals=jnp.where(mask[:, None], cloud.normals[index], 0.0),
+        mask=mask,
+    )
+
+
+def jitter(key: jax.Array, cloud: PointCloud, drawing: Drawing) -> PointCloud:
+    """Adds clipped Gaussian noise to the points; normals stay, as in the paper's protocol."""
+    noise = drawing.noise * jax.random.normal(key, cloud.xyz.shape)
+    noise = jnp.clip(noise, -drawing.noise_clip, drawing.noise_clip)
+    return cloud.replace(xyz=cloud.xyz + jnp.where(cloud.mask[:, None], noise, 0.0))
+
+
+def draw_pose(key: jax.Array, drawing: Drawing) -> RigidTransform:
+    """A random rigid motion of at most the drawing's rotation and translation."""
+    axis_key, angle_key, translation_key = jax.random.split(key, 3)
+    axis = jax.random.normal(axis_key, (3,))
+    axis = axis / jnp.linalg.norm(axis)
+    angle = jnp.deg2rad(drawing.max_rotation_deg) * jax.random.uniform(angle_key)
+    limit = drawing.max_translation
+    translation = jax.random.uniform(translation_key, (3,), minval=-limit, maxval=limit)
+    return RigidTransform(rotation=exp_so3(axis * angle), translation=translation)
+
+
+def draw_target(key: jax.Array, bank: ScanBank, drawing: Drawing) -> PointCloud:
+    """A noisy reference [M]: one serves a whole batch of views."""
+    subset_key, noise_key = jax.random.split(key)
+    size = jnp.asarray(drawing.num_reference)
+    return jitter(
+        noise_key, draw_subset(subset_key, bank.reference, size, drawing.num_reference), drawing
+    )
+
+
+def draw_source(
+    key: jax.Array, bank: ScanBank, view: jax.Array, drawing: Drawing
+) -> tuple[PointCloud, RigidTransform]:
+    """A noisy source [N] of one view, moved by a random pose, and its target_from_source."""
+    subset_key, noise_key, pose_key = jax.random.split(key, 3)
+    scan = jax.tree.map(lambda leaf: leaf[view], bank.scans)
+    subset = draw_subset(subset_key, scan, bank.source_sizes[view], drawing.num_source)
+    source_from_target = draw_pose(pose_key, drawing)
+    moved = jitter(noise_key, subset, drawing).transform(source_from_target)
+    # Padding moves with the rest, then goes back to zero: it must stay finite, nothing more.
+    moved = moved.replace(xyz=jnp.where(moved.mask[:, None], moved.xyz, 0.0))
+    return moved, source_from_target.inverse()
+
+
+def draw_pairs(key: jax.Array, bank: ScanBank, views: jax.Array, drawing: Drawing) -> Pair:
+    """A batch that shares one reference.
+
+    Returns:
+      Pair with source [B, N] and target_from_source [B], and one target [M] for all of them.
+    """
+    target_key, source_key = jax.random.split(key)
+    keys = jax.random.split(source_key, views.shape[0])
+    source, target_from_source = jax.vmap(lambda k, v: draw_source(k, bank, v, drawing))(
+        keys, views
+    )
+    return Pair(
+        source=source,
+        target=draw_target(target_key, bank, drawing),
+        target_from_source=target_from_source,
+    )

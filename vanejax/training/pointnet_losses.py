@@ -1,0 +1,182 @@
+"""What PointNetLK and PCRNet learn from: the pose, and the distance to the template.
+
+Both networks hold the pose constant between their iterations, so that each iteration learns to
+make the best of where it starts; the losses are sums over the iterations, of which the last counts
+most.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from vanejax.matching.baselines.pcrnet import PcrNet
+from vanejax.matching.baselines.pointnetlk import PointNetLK
+from vanejax.matching.metrics import nearest_offsets, pose_metrics
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+from vanejax.training import loss_terms as losses
+from vanejax.training.gradient_accumulation import accumulate
+from vanejax.training.pairs import Pair
+from vanejax.training.train_step import Metrics, Variables
+
+
+@dataclasses.dataclass(frozen=True)
+class PointNetLKLoss:
+    """A `vanejax.training.train_step.Loss` for PointNetLK.
+
+    Published: the matrix loss after the last iteration, with gradients through all of them, and in
+    the code the sum of squares of the last residual. Here each iteration counts, and the residual
+    is a mean, left out by default: that of a partial scan is not 0 at the true pose.
+
+    Attributes:
+      iterations: of the network in training; 10 as published.
+      discount: weight of an iteration relative to the next; 0 leaves the last alone.
+      matrix: factor of `matrix_loss`; 1 as published.
+      residual: factor of the mean square of the features' residual.
+      pairs_at_once: pairs of a batch that are computed side by side. It should divide the batch,
+        and changes rounding only.
+    """
+
+    iterations: int = 10
+    discount: float = 0.5
+    matrix: float = 1.0
+    residual: float = 0.0
+    pairs_at_once: int = 1
+
+    def __call__(
+        self, model: PointNetLK, variables: Variables, pairs: Pair
+    ) -> tuple[jax.Array, Metrics]:
+        """Mean loss [] over a batch that shares its target, and mean metrics [].
+
+        Metrics: each part of the loss and the pose error, all after the last iteration.
+        """
+        # Once for the batch: seven passes of the encoder, and the pseudo-inverse.
+        template = model.apply(variables, pairs.target, method="template")
+
+        def of_pair(
+            shared: Any, source: PointCloud, truth: RigidTransform
+        ) -> tuple[jax.Array, Metrics]:
+            variables, template = shared
+            init = RigidTransform.identity()
+            steps = model.apply(
+                variables, source, pairs.target, init, self.iterations, template=template
+            )
+            poses = steps.target_from_source
+            parts = {"matrix": jax.vmap(matrix_loss, (0, None))(poses, truth)}
+            if self.residual:
+                parts["residual"] = jnp.mean(steps.residual**2, axis=-1)
+            return _of_iterations(self, parts, poses, truth)
+
+        return _mean_over_pairs(of_pair, (variables, template), pairs, self.pairs_at_once)
+
+
+@dataclasses.dataclass(frozen=True)
+class PcrNetLoss:
+    """A `vanejax.training.train_step.Loss` for PCRNet.
+
+    Published: the earth mover's distance between the moved source and the template, or Chamfer's,
+    after the last iteration, no pose. Both take the whole template to be seen: the half of
+    Chamfer's that goes from the template to a partial scan pulls the scan over what it never saw.
+    Here that half is left out; and since the true pose is known, it can be learned from directly.
+
+    Attributes:
+      iterations: of the network in training; 8 as published.
+      discount: weight of an iteration relative to the next; 0 leaves the last alone.
+      pose: factor of `losses.pose_loss`; 0 as published.
+      chamfer: factor of `chamfer_loss`.
+      pairs_at_once: see `PointNetLKLoss`.
+    """
+
+    iterations: int = 8
+    discount: float = 0.5
+    pose: float = 1.0
+    chamfer: float = 0.0
+    pairs_at_once: int = 1
+
+    def __call__(
+        self, model: PcrNet, variables: Variables, pairs: Pair
+    ) -> tuple[jax.Array, Metrics]:
+        """Mean loss [] over a batch that shares its target, and mean metrics [].
+
+        Metrics: each part of the loss and the pose error, all after the last iteration.
+        """
+        template = model.apply(variables, pairs.target, method="template")
+
+        def of_pair(
+            shared: Any, source: PointCloud, truth: RigidTransform
+        ) -> tuple[jax.Array, Metrics]:
+            variables, template = shared
+            init = RigidTransform.identity()
+            poses = model.apply(
+                variables, source, pairs.target, init, self.iterations, template=template
+            )
+            parts = {"pose": jax.vmap(losses.pose_loss, (0, None, None))(poses, truth, source)}
+            if self.chamfer:
+                chamfer = jax.vmap(chamfer_loss, (0, None, None))
+                parts["chamfer"] = chamfer(poses, source, pairs.target)
+            return _of_iterations(self, parts, poses, truth)
+
+        return _mean_over_pairs(of_pair, (variables, template), pairs, self.pairs_at_once)
+
+
+def matrix_loss(found: RigidTransform, truth: RigidTransform) -> jax.Array:
+    """``|found^-1 truth - I|^2`` [], the squared Frobenius norm of a 4 x 4 matrix.
+
+    Source: PointNetLK, section 3.3. Radians and the unit of the poses are added up.
+    """
+    rest = (found.inverse() @ truth).as_matrix()
+    return jnp.sum((rest - jnp.eye(4, dtype=rest.dtype)) ** 2)
+
+
+def chamfer_loss(found: RigidTransform, source: PointCloud, target: PointCloud) -> jax.Array:
+    """Mean squared distance from the moved source [N] to the nearest points of the target [M].
+
+    [] f32, unit-sphere units squared: one half of Chamfer's distance. The target is not empty.
+    """
+    offsets, _ = nearest_offsets(source.transform(found), target)
+    squared = jnp.sum(offsets**2, axis=-1)
+    return jnp.sum(squared, where=source.mask) / jnp.maximum(jnp.sum(source.mask), 1)
+
+
+def _of_iterations(
+    loss: PointNetLKLoss | PcrNetLoss,
+    parts: Metrics,
+    poses: RigidTransform,
+    truth: RigidTransform,
+) -> tuple[jax.Array, Metrics]:
+    """The discounted sum [] of parts [I] times their factors, and the last iteration's metrics."""
+    last = jnp.arange(loss.iterations - 1.0, -1.0, -1.0)
+    per_iteration = sum(getattr(loss, name) * value for name, value in parts.items())
+    total = jnp.sum(loss.discount**last * per_iteration)
+    pose = jax.tree.map(lambda leaf: leaf[-1], poses)
+    return total, {name: value[-1] for name, value in parts.items()} | pose_metrics(pose, truth)
+
+
+def _mean_over_pairs(
+    of_pair: Callable[[Any, PointCloud, RigidTransform], tuple[jax.Array, Metrics]],
+    shared: Any,
+    pairs: Pair,
+    pairs_at_once: int,
+) -> tuple[jax.Array, Metrics]:
+    """Mean of ``of_pair(shared, source, truth)``, differentiable in ``shared``."""
+    batch = pairs.source.mask.shape[0]
+    at_once = math.gcd(batch, pairs_at_once)
+
+    def some_pairs(
+        shared: Any, carry: tuple[()], some: tuple
+    ) -> tuple[jax.Array, tuple[()], Metrics]:
+        totals, metrics = jax.vmap(of_pair, in_axes=(None, 0, 0))(shared, *some)
+        return jnp.sum(totals), carry, metrics
+
+    some = jax.tree.map(
+        lambda leaf: leaf.reshape(batch // at_once, at_once, *leaf.shape[1:]),
+        (pairs.source, pairs.target_from_source),
+    )
+    total, _, metrics = accumulate(some_pairs, shared, (), some)
+    return total / batch, jax.tree.map(jnp.mean, metrics)

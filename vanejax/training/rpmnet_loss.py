@@ -1,0 +1,109 @@
+"""The loss of RPM-Net over its iterations, and what vanejax adds to it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from vanejax.matching.metrics import pose_metrics
+from vanejax.matching.rpmnet import Match, RpmNet
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+from vanejax.training import loss_terms as losses
+from vanejax.training.gradient_accumulation import accumulate
+from vanejax.training.pairs import Pair
+from vanejax.training.train_step import Metrics, Variables
+
+
+@dataclasses.dataclass(frozen=True)
+class RpmNetLoss:
+    """A `vanejax.training.train_step.Loss` for RPM-Net.
+
+    Attributes:
+      iterations: of the network in training.
+      discount: weight of an iteration relative to the next.
+      pose: factor of `losses.pose_loss`; 1 as published.
+      inlier: factor of `losses.inlier_loss`; 0.01 as published.
+      matching: factor of `losses.matching_loss`; 0 as published.
+      matching_sigma: its width, unit-sphere units.
+      partner: factor of `losses.partner_loss`; 0 as published.
+      pairs_at_once: pairs of a batch that are computed side by side: 1 suits the caches of a CPU,
+        the whole batch a GPU. It should divide the batch, and changes rounding only.
+    """
+
+    iterations: int = 2
+    discount: float = 0.5
+    pose: float = 1.0
+    inlier: float = 0.01
+    matching: float = 0.0
+    matching_sigma: float = 0.04
+    partner: float = 0.0
+    pairs_at_once: int = 1
+
+    def of_match(self, match: Match, source: Any, pair: Pair) -> tuple[jax.Array, Metrics]:
+        """Loss [] of one iteration for one pair, and its parts."""
+        truth = pair.target_from_source
+        parts = {"pose": losses.pose_loss(match.target_from_source, truth, source)}
+        parts["inlier"] = losses.inlier_loss(match, source, pair.target)
+        if self.matching:
+            parts["matching"] = losses.matching_loss(
+                match, source, pair.target, truth, sigma=self.matching_sigma
+            )
+        if self.partner:
+            parts["partner"] = losses.partner_loss(match, source, truth)
+        return sum(getattr(self, name) * value for name, value in parts.items()), parts
+
+    def __call__(
+        self, model: RpmNet, variables: Variables, pairs: Pair
+    ) -> tuple[jax.Array, Metrics]:
+        """Mean loss [] over a batch that shares its target, and mean metrics [].
+
+        Metrics: each part of the loss and the pose error, all after the last iteration.
+        """
+        # Once for the batch: the reference is the same for every view.
+        features = model.apply(variables, pairs.target, method="features")
+        weights = self.discount ** jnp.arange(self.iterations - 1.0, -1.0, -1.0)
+
+        def of_pair(
+            shared: tuple[Variables, jax.Array], source: PointCloud, truth: RigidTransform
+        ) -> tuple[jax.Array, Metrics]:
+            pair = Pair(source=source, target=pairs.target, target_from_source=truth)
+            near = model.apply(variables, source, method="neighborhoods")
+
+            def iteration(
+                shared: tuple[Variables, jax.Array], pose: RigidTransform, weight: jax.Array
+            ) -> tuple[jax.Array, RigidTransform, Metrics]:
+                variables, features = shared
+                match = model.apply(
+                    variables, source, near, pair.target, features, pose, method="match"
+                )
+                value, parts = self.of_match(match, source, pair)
+                pose = match.target_from_source
+                return weight * value, pose, parts | pose_metrics(pose, truth)
+
+            # the published network does not differentiate through the pose either
+            init = jax.tree.map(jnp.asarray, RigidTransform.identity())
+            total, _, metrics = accumulate(iteration, shared, init, weights)
+            return total, jax.tree.map(lambda leaf: leaf[-1], metrics)
+
+        def some_pairs(
+            shared: tuple[Variables, jax.Array], carry: tuple[()], some: tuple
+        ) -> tuple[jax.Array, tuple[()], Metrics]:
+            if at_once == 1:
+                total, metrics = of_pair(shared, *jax.tree.map(lambda leaf: leaf[0], some))
+                return total, carry, metrics
+            totals, metrics = jax.vmap(of_pair, in_axes=(None, 0, 0))(shared, *some)
+            return jnp.sum(totals), carry, metrics
+
+        batch = pairs.source.mask.shape[0]
+        at_once = math.gcd(batch, self.pairs_at_once)
+        some = jax.tree.map(
+            lambda leaf: leaf.reshape(batch // at_once, at_once, *leaf.shape[1:]),
+            (pairs.source, pairs.target_from_source),
+        )
+        total, _, metrics = accumulate(some_pairs, (variables, features), (), some)
+        return total / batch, jax.tree.map(jnp.mean, metrics)

@@ -1,0 +1,170 @@
+"""Sets of generic shapes to train on, from whatever the user has, and what to call them."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from vanejax.errors import InputError
+from vanejax.files import array_header
+from vanejax.training.generic_solids import make_solids
+from vanejax.training.modelnet40 import PUBLISHED, read_modelnet40, thinned
+
+NUM_SOLIDS = 200
+MAX_BYTES = 2**32  # of an array: a compressed file may promise any size
+RADIUS = 1.001  # of the unit sphere once its points are rounded to float16
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ShapeSet:
+    """Shapes, each sampled in a frame of its own.
+
+    Attributes:
+      points: [S, P, 3] f32, in the unit sphere.
+      normals: [S, P, 3] f32, unit length.
+      names: [S].
+      title: what every output calls the set, in words.
+      sha256: hex digest of points and normals (little-endian) and names: the same for the same
+        training data, wherever they came from.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    names: tuple[str, ...]
+    title: str
+    sha256: str
+
+
+def load_shapes(
+    where: str,
+    *,
+    seed: int,
+    num_points: int = 4096,
+    split: str = "train",
+    categories: str = "first 20",
+) -> ShapeSet:
+    """The shapes that ``where`` stands for.
+
+    Args:
+      where: ``solids`` or ``solids:COUNT`` (procedural, see `vanejax.training.generic_solids`); a
+        folder of
+        ModelNet40, see `vanejax.training.modelnet40`; or a .npz file with ``points_normals``
+        [S, P, 6], float16 or float32, in the unit sphere, and ``names`` [S].
+      seed: of the solids, of the samples on meshes, and of which points are kept.
+      num_points: of each shape, at least 1; fewer where the file holds fewer.
+      split, categories: of a ModelNet40 folder; see `read_modelnet40`.
+
+    Raises:
+      InputError: nothing of the kind is there, or it cannot be used; the message says why.
+    """
+    if num_points < 1:
+        raise InputError(f"num_points={num_points}: ask for at least 1")
+    if seed < 0:
+        raise InputError(f"seed={seed}: must not be negative")
+    kind, _, count = where.partition(":")
+    if kind == "solids":
+        wanted = _count(count, where) if count else NUM_SOLIDS
+        samples, names = make_solids(wanted, seed, num_points=num_points)
+        title = f"{wanted} procedural solids of seed {seed} (random, not ModelNet40)"
+        return _shape_set(samples, names, title)
+    path = Path(where)
+    if path.suffix == ".npz":
+        samples, names = _read_npz(path)
+        title = f"{len(names)} shapes of the file {path.name}"
+        return _shape_set(thinned(samples, num_points, seed), names, title, path)
+    found = read_modelnet40(
+        path, split=split, categories=categories, seed=seed, num_points=num_points
+    )
+    published = PUBLISHED[found.layout, split]
+    whole = "as published" if found.split_size == published else f"where {published} are published"
+    title = (
+        f"ModelNet40 ({found.layout}), {split} split, {categories} categories: {len(found.names)} "
+        f"shapes of {found.split_size}, {whole}"
+    )
+    return _shape_set(found.samples, found.names, title, path)
+
+
+def _count(text: str, where: str) -> int:
+    if not (text.isascii() and text.isdigit()) or int(text) < 1:
+        raise InputError(f"{where!r}: write solids:COUNT with a positive number, as in solids:200")
+    return int(text)
+
+
+def _shape_set(
+    samples: np.ndarray, names: list[str], title: str, path: Path | None = None
+) -> ShapeSet:
+    """Checks samples [S, P, 6] and gives their normals unit length."""
+    samples = samples.astype(np.float32)
+    if not np.isfinite(samples).all():
+        bad = names[int(np.argmin(np.isfinite(samples).all(axis=(1, 2))))]
+        raise InputError(f"{path}: shape {bad!r} has numbers that are not finite")
+    points, normals = np.ascontiguousarray(samples[..., :3]), samples[..., 3:]
+    reach = np.linalg.norm(points, axis=2).max(axis=1)
+    if np.any(reach > RADIUS):
+        raise InputError(
+            f"{path}: shape {names[int(np.argmax(reach))]!r} reaches {reach.max():.3g} from its "
+            "origin; shapes should be moved and scaled into the unit sphere"
+        )
+    length = np.linalg.norm(normals, axis=2)
+    # a point on a face without area has no normal: it becomes a copy of one that has
+    usable = length > 0
+    if not usable.any(axis=1).all():
+        bad = names[int(np.argmin(usable.any(axis=1)))]
+        raise InputError(f"{path}: shape {bad!r} has no normals, all are of length zero")
+    row = np.where(usable, np.arange(usable.shape[1]), usable.argmax(axis=1)[:, None])[..., None]
+    points, normals = (np.take_along_axis(part, row, axis=1) for part in (points, normals))
+    normals = normals / np.linalg.norm(normals, axis=2, keepdims=True)
+    digest = hashlib.sha256(points.astype("<f4").tobytes())
+    digest.update(normals.astype("<f4").tobytes())
+    digest.update("\n".join(names).encode())
+    return ShapeSet(points, normals, tuple(names), title, digest.hexdigest())
+
+
+def _read_npz(path: Path) -> tuple[np.ndarray, list[str]]:
+    """Samples [S, P, 6] and names [S], nothing unpickled."""
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            samples, names = (_array(archive, name) for name in ("points_normals", "names"))
+    except (
+        ValueError,
+        OSError,
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        NotImplementedError,
+        RuntimeError,
+    ) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from error
+    except KeyError as error:
+        raise InputError(f"{path}: should hold 'points_normals' and 'names'") from error
+    if samples.ndim != 3 or samples.shape[2] != 6 or 0 in samples.shape:
+        raise InputError(f"{path}: points_normals has shape {samples.shape}, not [S, P, 6]")
+    if samples.dtype.kind != "f" or samples.dtype.itemsize not in (2, 4):
+        raise InputError(f"{path}: points_normals is {samples.dtype}, not float16 or float32")
+    if names.shape != samples.shape[:1] or names.dtype.kind != "U":
+        raise InputError(f"{path}: names should be {len(samples)} strings")
+    return samples, names.tolist()
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """One array, compressed or not; no larger than what the archive announces and `MAX_BYTES`."""
+    entry = archive.getinfo(f"{name}.npy")
+    if entry.file_size > MAX_BYTES:
+        raise ValueError(f"{name} announces {entry.file_size:,} bytes")
+    with archive.open(entry) as file:
+        shape, fortran, dtype = array_header(file)
+        data = file.read()
+    if (
+        dtype.hasobject
+        or fortran
+        or len(data) != int(np.prod(shape, dtype=object)) * dtype.itemsize
+    ):
+        raise ValueError(f"{name} does not hold the array that it announces")
+    return np.frombuffer(data, dtype).reshape(shape)

@@ -1,0 +1,329 @@
+"""A trained matcher in one self-contained file: weights, settings, and the part it knows.
+
+The file is an .npz of plain arrays: ``header`` (JSON as bytes), the thinned surface of the part,
+and the weights under their paths in the network. Nothing is unpickled, no size in it is trusted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vanejax.cad.nearest_face import NearestFace
+from vanejax.cad.part import Part
+from vanejax.errors import InputError
+from vanejax.files import read_stored_arrays, whole_file
+from vanejax.matching.rpmnet import RpmNet
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+from vanejax.scanner.camera import Camera
+from vanejax.training.pairs import Drawing
+
+FORMAT = "vanejax matcher"
+VERSION = 1
+MAX_BYTES = 1 << 28
+SAME_SURFACE = 1e-3  # of the radius: how far two files of one part may be apart
+
+# what a header may say: kind, smallest, largest; wide, but no network is beyond
+_MODEL = {
+    "num_neighbors": (int, 1, 1024),
+    "radius": (float, 1e-6, 100.0),
+    "sinkhorn_iterations": (int, 1, 1000),
+    "feature_width": (int, 8, 4096),
+}
+_DRAWING = {
+    "num_reference": (int, 16, 1 << 22),
+    "num_source": (int, 16, 1 << 22),
+    "noise": (float, 0.0, 10.0),
+    "noise_clip": (float, 0.0, 10.0),
+    "max_rotation_deg": (float, 0.0, 180.0),
+    "max_translation": (float, 0.0, 100.0),
+}
+_REFERENCE = ("reference_points", "reference_normals")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TrainedMatcher:
+    """An RPM-Net trained for one part, and all that inference with it needs.
+
+    The network sees unit-sphere units of the part: ``(x_part - center) / radius_mm``.
+
+    Attributes:
+      model: the network.
+      variables: its weights, numpy f32; the moving average that training kept.
+      iterations: of the network at inference.
+      drawing: how pairs were drawn in training: points, noise, and the poses it learned to undo.
+        A scan of X thinned points gives ``num_reference X / Y`` source points, with Y the number
+        of ``reference_points``, in ``num_source`` rows.
+      voxel_mm: thinning of scan and part before points are drawn.
+      center: [3] f64, mm, part frame.
+      radius_mm: of the part.
+      reference_points: [Y, 3] f32, mm, part frame: its surface, thinned.
+      reference_normals: [Y, 3] f32, unit, outward.
+      part_name, part_sha256: the part it was trained for.
+      camera: that the scans of its training were taken with.
+      trained: where it comes from, such as step, versions and commit.
+    """
+
+    model: RpmNet
+    variables: Mapping[str, Any]
+    iterations: int
+    drawing: Drawing
+    voxel_mm: float
+    center: np.ndarray
+    radius_mm: float
+    reference_points: np.ndarray
+    reference_normals: np.ndarray
+    part_name: str
+    part_sha256: str
+    camera: Camera
+    trained: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def knows(self, part: Part) -> bool:
+        """Whether the network was trained for this part, or for the same surface in another file.
+
+        A CAD model written again, or built with other rounding, has another hash; its surface is
+        the same where every reference point lies on it and all of it is near one of them.
+        """
+        if part.sha256 == self.part_sha256:
+            return True
+        slack = SAME_SURFACE * self.radius_mm
+        shift = np.abs(part.center - self.center).max()
+        if max(shift, abs(part.radius - self.radius_mm)) > slack:
+            return False
+        points = self.reference_points.astype(np.float64)
+        off = np.linalg.norm(NearestFace(part).feet(points).points - points, axis=1)
+        gaps, _ = cKDTree(points).query(part.sample(len(points), 0)[0])
+        # no point of a surface is farther from the point that its voxel keeps than its diagonal
+        return bool(off.max() <= slack and gaps.max() <= 2 * self.voxel_mm)
+
+    def check_part(self, part: Part) -> None:
+        """Refuses a part that the network was not trained for.
+
+        Raises:
+          InputError: names both parts and their hashes.
+        """
+        if not self.knows(part):
+            raise InputError(
+                f"the weights were trained for {self.part_name} (sha256 {self.part_sha256[:12]}), "
+                f"this part is {part.name} (sha256 {part.sha256[:12]}): train for it, give that "
+                "part, or leave the weights out"
+            )
+
+
+def save_model(path: str | os.PathLike[str], matcher: TrainedMatcher) -> None:
+    """Writes the file; it appears complete or not at all.
+
+    Raises:
+      InputError: it cannot be written, or the matcher is not one that `load_model` would take.
+    """
+    path = Path(path)
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "units": "mm and degrees; radius, noise and max_translation in radii of the part",
+        "model": {name: getattr(matcher.model, name) for name in _MODEL},
+        "iterations": matcher.iterations,
+        "drawing": dataclasses.asdict(matcher.drawing),
+        "voxel_mm": matcher.voxel_mm,
+        "part": {
+            "name": matcher.part_name,
+            "sha256": matcher.part_sha256,
+            "center_mm": np.asarray(matcher.center, np.float64).tolist(),
+            "radius_mm": float(matcher.radius_mm),
+        },
+        "camera": matcher.camera.to_dict(),
+        "trained": dict(matcher.trained),
+    }
+    text = json.dumps(header, sort_keys=True).encode()
+    arrays = weights_by_name(matcher.variables)
+    arrays |= {name: np.asarray(getattr(matcher, name)) for name in _REFERENCE}
+    _matcher(json.loads(text), arrays, path)
+    with whole_file(path) as partial, open(partial, "wb") as file:
+        np.savez(file, header=np.frombuffer(text, np.uint8), **arrays)
+
+
+def load_model(path: str | os.PathLike[str]) -> TrainedMatcher:
+    """Reads what `save_model` wrote.
+
+    Raises:
+      InputError: no such file, truncated, of another kind or version, or arrays that are not those
+        of the network that its header describes.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        raise InputError(
+            f"{path}: is a folder or a device; a work folder becomes weights by export"
+        )
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: is too large for weights of vanejax")
+        arrays = read_stored_arrays(path)
+    except FileNotFoundError:
+        raise InputError(
+            f"{path}: no such file (looked in {path.parent.absolute()}); "
+            "`vanejax export WORKDIR` makes one"
+        ) from None
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{path}: truncated or no weights of vanejax ({error}); export them again"
+        ) from error
+    return _matcher(_read_header(arrays.pop("header", None), path), arrays, path)
+
+
+def weights_by_name(variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The leaves of a tree of weights, named ``params/feature_net/prepool_0/dense/kernel``."""
+    return {
+        jax.tree_util.keystr(place, simple=True, separator="/"): np.asarray(leaf)
+        for place, leaf in jax.tree.leaves_with_path(variables)
+    }
+
+
+def abstract_variables(model: RpmNet) -> Any:
+    """The shapes and dtypes of a network's weights; nothing is computed."""
+    # how many points there are does not change the weights
+    cloud = PointCloud(
+        xyz=jax.ShapeDtypeStruct((4, 3), np.float32),
+        normals=jax.ShapeDtypeStruct((4, 3), np.float32),
+        mask=jax.ShapeDtypeStruct((4,), bool),
+    )
+    return jax.eval_shape(
+        lambda cloud: model.init(jax.random.key(0), cloud, cloud, RigidTransform.identity(), 1),
+        cloud,
+    )
+
+
+def model_from_dict(values: Any, where: str) -> RpmNet:
+    """The network of a dict of its settings, each checked.
+
+    Raises:
+      InputError: a setting is missing, unknown or cannot be; the message starts with ``where``.
+    """
+    settings = _fields(values, _MODEL, f"{where}, model")
+    if settings["feature_width"] % 8:
+        raise InputError(
+            f"{where}, model: feature_width={settings['feature_width']} is no multiple of 8"
+        )
+    return RpmNet(**settings)
+
+
+def _matcher(header: dict[str, Any], arrays: dict[str, np.ndarray], path: Path) -> TrainedMatcher:
+    """Checks everything that a header and arrays say, and puts it together."""
+    where = str(path)
+    model = model_from_dict(header["model"], where)
+    part = header["part"] if isinstance(header["part"], dict) else {}
+    center = part.get("center_mm")
+    if not isinstance(center, list) or len(center) != 3:
+        raise InputError(f"{where}, part: center_mm={center!r} should be three numbers")
+    names = {name: part.get(name) for name in ("name", "sha256")}
+    if not all(isinstance(value, str) for value in names.values()):
+        raise InputError(f"{where}, part: name and sha256 should be text, not {names}")
+    try:
+        camera = Camera.from_dict(header["camera"])
+    except (InputError, TypeError, ValueError) as error:
+        raise InputError(f"{where}, camera: {error}") from error
+    matcher = TrainedMatcher(
+        model=model,
+        variables=_variables(model, arrays, where),
+        iterations=_number(header["iterations"], int, 1, 1000, f"{where}: iterations"),
+        drawing=Drawing(**_fields(header["drawing"], _DRAWING, f"{where}, drawing")),
+        voxel_mm=_number(header["voxel_mm"], float, 1e-6, 1e6, f"{where}: voxel_mm"),
+        center=np.array(
+            [_number(c, float, -1e9, 1e9, f"{where}, part: center_mm") for c in center]
+        ),
+        radius_mm=_number(part.get("radius_mm"), float, 1e-6, 1e9, f"{where}, part: radius_mm"),
+        reference_points=arrays["reference_points"],
+        reference_normals=arrays["reference_normals"],
+        part_name=names["name"],
+        part_sha256=names["sha256"],
+        camera=camera,
+        trained=header["trained"] if isinstance(header["trained"], dict) else {},
+    )
+    points, normals = matcher.reference_points, matcher.reference_normals
+    if points.shape != normals.shape or points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(
+            f"{where}: reference_points {points.shape} and reference_normals {normals.shape} "
+            "should both be [Y, 3]"
+        )
+    if len(points) < matcher.drawing.num_reference:
+        raise InputError(
+            f"{where}: {len(points)} reference points, fewer than the "
+            f"{matcher.drawing.num_reference} that are to be drawn from them"
+        )
+    return matcher
+
+
+def _variables(model: RpmNet, arrays: Mapping[str, np.ndarray], where: str) -> Any:
+    """The tree of weights, after names, shapes, dtypes and values were checked."""
+    abstract = abstract_variables(model)
+    wanted = {
+        jax.tree_util.keystr(place, simple=True, separator="/"): leaf
+        for place, leaf in jax.tree.leaves_with_path(abstract)
+    }
+    missing = sorted((set(wanted) | set(_REFERENCE)) - set(arrays))
+    extra = sorted(set(arrays) - set(wanted) - set(_REFERENCE))
+    if missing or extra:
+        told = [
+            f"{word} {', '.join(names[:5])}{' ...' if len(names) > 5 else ''}"
+            for word, names in (("missing:", missing), ("unknown:", extra))
+            if names
+        ]
+        raise InputError(f"{where}: not the arrays of this network; {'; '.join(told)}")
+    for name, leaf in wanted.items():
+        value = arrays[name]
+        if value.shape != leaf.shape or value.dtype != leaf.dtype:
+            raise InputError(
+                f"{where}: {name} is {value.dtype} {value.shape}, "
+                f"the network's is {leaf.dtype} {leaf.shape}"
+            )
+    for name, value in arrays.items():
+        if value.dtype != np.float32:
+            raise InputError(f"{where}: {name} is {value.dtype}, not float32")
+        if not np.isfinite(value).all():
+            raise InputError(f"{where}: {name} holds values that are not finite")
+    return jax.tree.unflatten(jax.tree.structure(abstract), [arrays[name] for name in wanted])
+
+
+def _read_header(raw: np.ndarray | None, path: Path) -> dict[str, Any]:
+    try:
+        header = json.loads(raw.tobytes()) if raw is not None else None
+    except (ValueError, RecursionError):
+        header = None
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise InputError(f"{path}: no weights of vanejax; `vanejax export WORKDIR` makes them")
+    if header.get("version") != VERSION:
+        raise InputError(
+            f"{path}: weights of version {header.get('version')!r}, this program reads {VERSION}; "
+            "export them again"
+        )
+    wanted = {"model", "iterations", "drawing", "voxel_mm", "part", "camera", "trained"}
+    if missing := sorted(wanted - set(header)):
+        raise InputError(f"{path}: its header has no {', '.join(missing)}")
+    return header
+
+
+def _fields(values: Any, limits: Mapping[str, tuple], where: str) -> dict[str, Any]:
+    """The numbers of a dict that must have exactly the names of ``limits``."""
+    names = set(values) if isinstance(values, dict) else set()
+    if names != set(limits):
+        raise InputError(f"{where}: has {sorted(names)}, should have {sorted(limits)}")
+    return {
+        name: _number(values[name], *limit, f"{where}: {name}") for name, limit in limits.items()
+    }
+
+
+def _number(value: Any, kind: type, low: float, high: float, where: str) -> Any:
+    right = isinstance(value, int) if kind is int else isinstance(value, int | float)
+    if not right or isinstance(value, bool) or not low <= value <= high:
+        raise InputError(f"{where}={value!r} should be {kind.__name__}, from {low:g} to {high:g}")
+    return kind(value)
