@@ -19,7 +19,7 @@ from experiments.runner.experiment import Experiment
 from vanejax import compilation_cache
 from vanejax.errors import InputError
 
-CONFIG_FOLDER = Path(__file__).parent / "configs"
+CONFIG_FOLDER = Path(__file__).parents[1] / "configs"
 flags.disclaim_key_flags()  # the flags defined here belong to the command that asks for them
 
 _OVERRIDE = re.compile(r"--?config\.([^=]+)")

@@ -508,7 +508,7 @@ def test_counts_in_numpy_files_are_not_trusted(tmp_path):
 
 def test_too_many_points_are_refused(tmp_path, monkeypatch):
     for module in ("point_records", "point_file"):
-        monkeypatch.setattr(f"vanejax.{module}.MAX_POINTS", 100)
+        monkeypatch.setattr(f"vanejax.scans.{module}.MAX_POINTS", 100)
     files = {"a.ply": PLY, "a.pcd": PCD_PACKED, "a.xyz": table(P), "a.npz": npz(points=P)}
     for name, data in files.items():
         with pytest.raises(InputError, match="thin the scan first"):

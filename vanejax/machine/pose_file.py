@@ -112,7 +112,7 @@ def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
 
 
 def euler_xyz_deg(rotation: np.ndarray) -> np.ndarray:
-    """`vanejax.rigid.euler_xyz_deg` for one rotation [3, 3], in float64 on the host."""
+    """`vanejax.matching.se3.euler_xyz_deg` for one rotation [3, 3], in float64 on the host."""
     r = np.asarray(rotation, np.float64)
     cosine = np.hypot(r[0, 0], r[1, 0])
     # below rounding only a - c or a + c is defined: c is 0
