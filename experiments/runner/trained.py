@@ -14,8 +14,7 @@ from experiments.runner.training_record import TrainingRecord
 from experiments.train import fit
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.matching.rpmnet import variables_from_torch
-from vanejax.matching.torch_weights import load_state_dict
+from vanejax.matching.torch_weights import load_state_dict, rpmnet_variables
 from vanejax.training.dataset import ScanSet
 from vanejax.training.train_step import Variables
 
@@ -58,7 +57,7 @@ def trained(
     if given.is_file():
         if config.model.name != "rpmnet":
             raise InputError(f"{given}: weights from PyTorch are read for an RPM-Net only")
-        return Trained(variables_from_torch(load_state_dict(given)), config, None)
+        return Trained(rpmnet_variables(load_state_dict(given)), config, None)
     record = read_json(given / "run.json")
     mine = json.loads(json.dumps(dataclasses.asdict(config)))
     theirs = record.get("config", {})

@@ -14,8 +14,8 @@ import scipy.special
 from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
-from vanejax.matching.rpmnet import RpmNet, last_match, rpmnet, variables_from_torch
-from vanejax.matching.torch_weights import load_state_dict
+from vanejax.matching.rpmnet import RpmNet, last_match, rpmnet
+from vanejax.matching.torch_weights import load_state_dict, rpmnet_variables
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 
@@ -53,7 +53,7 @@ def state_dict(seed: int = 0) -> dict[str, np.ndarray]:
 
 @functools.cache
 def random_variables() -> dict:
-    return variables_from_torch(state_dict())
+    return rpmnet_variables(state_dict())
 
 
 @functools.cache
@@ -404,7 +404,7 @@ def test_it_has_the_published_number_of_parameters():
 
 def test_import_from_a_file(tmp_path):
     np.savez(tmp_path / "weights.npz", **state_dict())
-    variables = variables_from_torch(load_state_dict(tmp_path / "weights.npz"))
+    variables = rpmnet_variables(load_state_dict(tmp_path / "weights.npz"))
     jax.tree.map(np.testing.assert_array_equal, variables, random_variables())
 
 
@@ -431,7 +431,7 @@ FIRST = "feat_extractor.prepool.0.weight"
 def test_import_refuses_another_model_and_names_what_differs(changes, words):
     state = {name: value for name, value in (state_dict() | changes).items() if value is not None}
     with pytest.raises(InputError, match=words.replace(".", r"\.")):
-        variables_from_torch(state)
+        rpmnet_variables(state)
 
 
 needs_parity = pytest.mark.skipif(
@@ -448,7 +448,7 @@ def published() -> tuple[dict[str, np.ndarray], RpmNet, dict]:
         radius=float(io["radius"]),
         sinkhorn_iterations=int(io["num_sinkhorn_iterations"]),
     )
-    return io, model, variables_from_torch(load_state_dict(PARITY / "rpmnet_weights.npz"))
+    return io, model, rpmnet_variables(load_state_dict(PARITY / "rpmnet_weights.npz"))
 
 
 @needs_parity

@@ -10,7 +10,6 @@ Coordinates are in unit-sphere units: the part's centre is the origin, its radiu
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,9 +17,7 @@ import flax.linen as nn
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from vanejax.errors import InputError
 from vanejax.matching.contract import Register, Registration
 from vanejax.matching.features import point_pair_features
 from vanejax.matching.iteration import last_iteration
@@ -34,6 +31,9 @@ from vanejax.matching.layers import (
 )
 from vanejax.matching.procrustes import weighted_procrustes
 from vanejax.matching.sinkhorn import log_sinkhorn, soft_correspondences
+from vanejax.matching.torch_weights import (
+    rpmnet_variables as variables_from_torch,  # noqa: F401  # the name of older scripts
+)
 from vanejax.pointcloud import PointCloud, ball_query
 from vanejax.rigid import RigidTransform
 
@@ -287,54 +287,3 @@ def registration_from_match(source: PointCloud, match: Match, iterations: int) -
         rmse=jnp.sqrt(squared),
         overlap=overlap,
     )
-
-
-def variables_from_torch(state_dict: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Flax variables from the published PyTorch state dict, by name.
-
-    Args:
-      state_dict: name to array, as `vanejax.matching.torch_weights.load_state_dict` reads it.
-
-    Raises:
-      InputError: a name is missing or unknown, a shape is not RPM-Net's, a value not finite.
-    """
-    left = dict(state_dict)
-
-    def take(name: str, *shape: int) -> np.ndarray:
-        if name not in left:
-            raise InputError(f"the state dict has no {name!r}: it is not a published RPM-Net's")
-        value = np.asarray(left.pop(name), np.float32)
-        # the kernel of a convolution has one or two axes of length 1 behind these
-        if value.shape[: len(shape)] != shape or value.size != np.prod(shape):
-            raise InputError(f"{name!r} has shape {value.shape}: RPM-Net's has {shape}")
-        if not np.isfinite(value).all():
-            raise InputError(f"{name!r} holds values that are not finite: its training diverged")
-        return value.reshape(shape)
-
-    def mlp(prefix: str, label: str, widths: tuple[int, ...], *, normed_last: bool) -> dict:
-        layers: dict[str, Any] = {}
-        for index, (channels, features) in enumerate(itertools.pairwise(widths)):
-            # torch.nn.Sequential numbers the convolution, its norm and its ReLU: steps of three.
-            dense, norm = (f"{prefix}.{label}.{3 * index + offset}" for offset in (0, 1))
-            layer = {
-                "kernel": take(f"{dense}.weight", features, channels).T,
-                "bias": take(f"{dense}.bias", features),
-            }
-            if normed_last or index < len(widths) - 2:
-                gain, bias = take(f"{norm}.weight", features), take(f"{norm}.bias", features)
-                layer = {"dense": layer, "norm": {"scale": gain, "bias": bias}}
-            layers[f"{label}_{index}"] = layer
-        return layers
-
-    def net(prefix: str, prepool: tuple[int, ...], postpool: tuple[int, ...]) -> dict[str, Any]:
-        return mlp(prefix, "prepool", prepool, normed_last=True) | mlp(
-            prefix, "postpool", postpool, normed_last=False
-        )
-
-    params = {
-        "feature_net": net("feat_extractor", (10, 96, 96, 192), (192, 192, 96, 96)),
-        "annealing_net": net("weights_net", (4, 64, 64, 64, 128, 1024), (1024, 512, 256, 2)),
-    }
-    if left:
-        raise InputError(f"the state dict has entries RPM-Net lacks: {', '.join(sorted(left)[:5])}")
-    return {"params": params}

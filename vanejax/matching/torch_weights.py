@@ -7,6 +7,7 @@ and offsets are checked against the bytes that are there.
 from __future__ import annotations
 
 import io
+import itertools
 import math
 import os
 import pathlib
@@ -15,6 +16,7 @@ import zipfile
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import numpy as np
 
 from vanejax.errors import InputError
@@ -276,3 +278,104 @@ def _strided_copy(
     stored = np.dtype(np.uint8) if dtype.kind == "b" else dtype
     view = np.ndarray(shape, stored, buffer=raw, offset=first * dtype.itemsize, strides=strides)
     return np.array(view != 0 if dtype.kind == "b" else view, order="C")
+
+
+def rpmnet_variables(state_dict: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Flax variables of the published RPM-Net's PyTorch weights.
+
+    Args:
+      state_dict: name to array, as `load_state_dict` reads it.
+
+    Raises:
+      InputError: a name is missing or unknown, a shape is not RPM-Net's, a value not finite.
+    """
+    weights = _StateDict(state_dict, "RPM-Net")
+
+    def mlp(prefix: str, label: str, widths: tuple[int, ...], *, normed_last: bool) -> dict:
+        layers: dict[str, Any] = {}
+        for index, (channels, features) in enumerate(itertools.pairwise(widths)):
+            # torch.nn.Sequential numbers the convolution, its norm and its ReLU: steps of three.
+            dense, norm = (f"{prefix}.{label}.{3 * index + offset}" for offset in (0, 1))
+            layer = {
+                "kernel": weights.take(f"{dense}.weight", features, channels).T,
+                "bias": weights.take(f"{dense}.bias", features),
+            }
+            if normed_last or index < len(widths) - 2:
+                scale = weights.take(f"{norm}.weight", features)
+                bias = weights.take(f"{norm}.bias", features)
+                layer = {"dense": layer, "norm": {"scale": scale, "bias": bias}}
+            layers[f"{label}_{index}"] = layer
+        return layers
+
+    def net(prefix: str, prepool: tuple[int, ...], postpool: tuple[int, ...]) -> dict[str, Any]:
+        return mlp(prefix, "prepool", prepool, normed_last=True) | mlp(
+            prefix, "postpool", postpool, normed_last=False
+        )
+
+    params = {
+        "feature_net": net("feat_extractor", (10, 96, 96, 192), (192, 192, 96, 96)),
+        "annealing_net": net("weights_net", (4, 64, 64, 64, 128, 1024), (1024, 512, 256, 2)),
+    }
+    weights.check_empty()
+    return jax.tree.map(np.float32, {"params": params})
+
+
+def pointnetlk_variables(state_dict: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Flax variables of a published PointNetLK's PyTorch weights.
+
+    Its batch normalisation, in evaluation, is affine and goes into the kernels.
+
+    Args:
+      state_dict: name to array, as `load_state_dict` reads it.
+
+    Raises:
+      InputError: a name is missing or unknown, a shape is not PointNetLK's, a value not finite, a
+        variance negative, or the Jacobian's step is not 0.01.
+    """
+    weights = _StateDict(state_dict, "PointNetLK")
+    if not np.allclose(weights.take("dt", 1, 6), 0.01):
+        raise InputError("'dt' is not 0.01: a learned step of the Jacobian is not supported")
+    encoder: dict[str, np.ndarray] = {}
+    for index, (channels, features) in enumerate(itertools.pairwise((3, 64, 64, 64, 128, 1024))):
+        convolution, norm = (f"feature_model.{kind}{index + 1}" for kind in ("conv", "bn"))
+        kernel = weights.take(f"{convolution}.weight", features, channels).T
+        bias = weights.take(f"{convolution}.bias", features)
+        gain, shift, mean, variance = (
+            weights.take(f"{norm}.{name}", features)
+            for name in ("weight", "bias", "running_mean", "running_var")
+        )
+        if variance.min() < 0:
+            raise InputError(f"'{norm}.running_var' holds a negative variance")
+        weights.arrays.pop(f"{norm}.num_batches_tracked", None)  # of no effect in evaluation
+        scale = gain / np.sqrt(variance + 1e-5)  # PyTorch's epsilon
+        encoder[f"kernel_{index}"] = np.float32(kernel * scale)
+        encoder[f"bias_{index}"] = np.float32((bias - mean) * scale + shift)
+    weights.check_empty()
+    return {"params": {"encoder": encoder}}
+
+
+class _StateDict:
+    """The arrays of a state dict that no layer has taken yet."""
+
+    def __init__(self, state_dict: Mapping[str, np.ndarray], network: str) -> None:
+        self.arrays = dict(state_dict)
+        self.network = network
+
+    def take(self, name: str, *shape: int) -> np.ndarray:
+        """The array of this name, f64, which may have further axes of length 1 (convolutions)."""
+        if name not in self.arrays:
+            raise InputError(
+                f"the state dict has no {name!r}: it is not a published {self.network}'s"
+            )
+        value = np.asarray(self.arrays.pop(name), np.float64)
+        if value.shape[: len(shape)] != shape or value.size != np.prod(shape):
+            raise InputError(f"{name!r} has shape {value.shape}: {self.network}'s has {shape}")
+        if not np.isfinite(value).all():
+            raise InputError(f"{name!r} holds values that are not finite: its training diverged")
+        return value.reshape(shape)
+
+    def check_empty(self) -> None:
+        """Refuses arrays that the network does not have."""
+        if self.arrays:
+            names = ", ".join(sorted(self.arrays)[:5])
+            raise InputError(f"the state dict has entries {self.network} lacks: {names}")

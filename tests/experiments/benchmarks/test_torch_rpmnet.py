@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from experiments.benchmarks.flops import dense_flops, feature_flops, match_flops
-from vanejax.matching.rpmnet import RpmNet, variables_from_torch
+from vanejax.matching.rpmnet import RpmNet
 from vanejax.matching.se3 import exp_so3
-from vanejax.matching.torch_weights import load_state_dict
+from vanejax.matching.torch_weights import load_state_dict, rpmnet_variables
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.training.pairs import Pair
@@ -38,7 +38,7 @@ def peer() -> TorchRpmNet:
 
 @pytest.fixture(scope="module")
 def variables(peer: TorchRpmNet) -> dict:
-    return variables_from_torch({k: v.numpy().copy() for k, v in peer.state_dict().items()})
+    return rpmnet_variables({k: v.numpy().copy() for k, v in peer.state_dict().items()})
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
 from vanejax.matching.baselines.pointnet import WIDTHS, registration_from_pose
-from vanejax.matching.baselines.pointnetlk import PointNetLK, pointnetlk, variables_from_torch
+from vanejax.matching.baselines.pointnetlk import PointNetLK, pointnetlk
+from vanejax.matching.torch_weights import pointnetlk_variables
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 
@@ -44,7 +45,7 @@ def state_dict() -> dict[str, np.ndarray]:
 
 @functools.cache
 def variables() -> dict:
-    return variables_from_torch(state_dict())
+    return pointnetlk_variables(state_dict())
 
 
 @functools.cache
@@ -371,12 +372,12 @@ VARIANCE = "feature_model.bn2.running_var"
 def test_import_refuses_another_model_and_names_what_differs(changes, words):
     state = {name: value for name, value in (state_dict() | changes).items() if value is not None}
     with pytest.raises(InputError, match=words.replace(".", r"\.")):
-        variables_from_torch(state)
+        pointnetlk_variables(state)
 
 
 def test_import_does_not_need_the_count_of_batches():
     state = {name: value for name, value in state_dict().items() if "num_batches" not in name}
-    jax.tree.map(np.testing.assert_array_equal, variables_from_torch(state), variables())
+    jax.tree.map(np.testing.assert_array_equal, pointnetlk_variables(state), variables())
 
 
 @pytest.mark.skipif(
@@ -385,7 +386,7 @@ def test_import_does_not_need_the_count_of_batches():
 def test_parity_with_the_published_weights():
     with np.load(PARITY / "pointnetlk.npz") as file:
         io = dict(file)
-    weights = variables_from_torch(
+    weights = pointnetlk_variables(
         {name[2:]: value for name, value in io.items() if name.startswith("w:")}
     )
     describe = jax.jit(functools.partial(MODEL.apply, method="template"))

@@ -9,7 +9,6 @@ is 1.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -17,9 +16,7 @@ import flax.linen as nn
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from vanejax.errors import InputError
 from vanejax.matching.baselines.pointnet import (
     WIDTHS,
     DenseLayers,
@@ -201,50 +198,3 @@ def pointnetlk(
         )
 
     return register
-
-
-def variables_from_torch(state_dict: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Flax variables from a published PyTorch state dict, by name.
-
-    Its batch normalisation, in evaluation, is affine and goes into the kernels.
-
-    Args:
-      state_dict: name to array, as `vanejax.matching.torch_weights.load_state_dict` reads it.
-
-    Raises:
-      InputError: a name is missing or unknown, a shape is not PointNetLK's, a value not finite, a
-        variance negative, or the Jacobian's step is not 0.01.
-    """
-    left = dict(state_dict)
-
-    def take(name: str, *shape: int) -> np.ndarray:
-        if name not in left:
-            raise InputError(f"the state dict has no {name!r}: it is not a published PointNetLK's")
-        value = np.asarray(left.pop(name), np.float64)
-        # the kernel of a convolution has an axis of length 1 behind these
-        if value.shape[: len(shape)] != shape or value.size != np.prod(shape):
-            raise InputError(f"{name!r} has shape {value.shape}: PointNetLK's has {shape}")
-        if not np.isfinite(value).all():
-            raise InputError(f"{name!r} holds values that are not finite: its training diverged")
-        return value.reshape(shape)
-
-    if not np.allclose(take("dt", 1, 6), PointNetLK.delta):
-        raise InputError("'dt' is not 0.01: a learned step of the Jacobian is not supported")
-    encoder: dict[str, np.ndarray] = {}
-    for index, (channels, features) in enumerate(itertools.pairwise(WIDTHS)):
-        convolution, norm = (f"feature_model.{kind}{index + 1}" for kind in ("conv", "bn"))
-        kernel = take(f"{convolution}.weight", features, channels).T
-        bias = take(f"{convolution}.bias", features)
-        gain, shift = take(f"{norm}.weight", features), take(f"{norm}.bias", features)
-        mean = take(f"{norm}.running_mean", features)
-        variance = take(f"{norm}.running_var", features)
-        if variance.min() < 0:
-            raise InputError(f"'{norm}.running_var' holds a negative variance")
-        left.pop(f"{norm}.num_batches_tracked", None)  # a count, of no effect in evaluation
-        scale = gain / np.sqrt(variance + 1e-5)  # PyTorch's epsilon
-        encoder[f"kernel_{index}"] = np.float32(kernel * scale)
-        encoder[f"bias_{index}"] = np.float32((bias - mean) * scale + shift)
-    if left:
-        names = ", ".join(sorted(left)[:5])
-        raise InputError(f"the state dict has entries PointNetLK lacks: {names}")
-    return {"params": {"encoder": encoder}}
