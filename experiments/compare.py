@@ -76,7 +76,7 @@ def compare(
             config.experiment_of(name), part, scans, workdir / name, runs.get(name)
         )
     bank = make_bank(test, num_reference=experiment.data.num_reference)
-    drawing, fine_step = experiment.make_drawing(scans), FineStep(part, test)
+    sampling, fine_step = experiment.pair_sampling(scans), FineStep(part, test)
     report: dict[str, Any] = {
         "name": config.name,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -102,7 +102,7 @@ def compare(
         results = register_views(
             register,
             bank,
-            drawing,
+            sampling,
             seed=experiment.seed,
             unit_mm=scans.radius_mm,
             progress=progress,

@@ -98,8 +98,8 @@ def matching_picture(matcher: TrainedMatcher, part: Part, views: Viewpoints, see
     """The soft assignment of a noisy test view by the untrained and by the trained network."""
     one = views.select(np.array([VIEW]))
     scans = make_scan_set(part, matcher.camera, one, voxel_mm=matcher.voxel_mm, progress=False)
-    bank = make_bank(scans, num_reference=matcher.drawing.num_reference)
-    pairs = draw_pairs(jax.random.key(seed), bank, np.array([0]), matcher.drawing)
+    bank = make_bank(scans, num_reference=matcher.sampling.num_reference)
+    pairs = draw_pairs(jax.random.key(seed), bank, np.array([0]), matcher.sampling)
     source, truth = jax.tree.map(lambda leaf: leaf[0], (pairs.source, pairs.target_from_source))
     model, start = matcher.model, RigidTransform.identity()
     untrained = model.init(jax.random.key(seed), source, pairs.target, start, 1)

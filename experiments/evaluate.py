@@ -97,7 +97,7 @@ def registered(
     return register_views(
         config.make_network().register(variables),
         make_bank(test, num_reference=config.data.num_reference),
-        config.make_drawing(scans),
+        config.pair_sampling(scans),
         seed=config.seed,
         unit_mm=scans.radius_mm,
         progress=progress,
@@ -129,10 +129,10 @@ def load_variables(
     Raises:
       InputError: no checkpoint there, or one of another model.
     """
-    model, drawing = config.make_network().model, config.make_drawing(scans)
+    model, sampling = config.make_network().model, config.pair_sampling(scans)
     bank = make_bank(scans, num_reference=config.data.num_reference)
     like = jax.eval_shape(
-        lambda: init_state(model, config.make_optimizer(), bank, drawing, seed=config.seed)
+        lambda: init_state(model, config.make_optimizer(), bank, sampling, seed=config.seed)
     )
     path = RunFolder(folder).checkpoints
     if not path.is_dir():

@@ -32,7 +32,7 @@ from vanejax.matching.metrics import pose_metrics
 from vanejax.rigid import RigidTransform
 from vanejax.training.checkpoint import Checkpoints, all_finite, restore_or
 from vanejax.training.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
-from vanejax.training.pairs import Bank, Drawing
+from vanejax.training.pairs import Bank, PairSampling
 from vanejax.training.train_step import Metrics, TrainState, Variables, init_state, make_train_step
 
 DIVERGED = 20.0  # times the loss of the first rows: no run of use comes back from there
@@ -91,19 +91,19 @@ def fit(config: Experiment, part: Part, scans: ScanSet, folder: RunFolder) -> Tr
     """Trains; of ``scans``, only the training views are looked at."""
     settings = config.training
     network, optimizer = config.make_network(), config.make_optimizer()
-    drawing, banks = config.make_drawing(scans), training_banks(config, part, scans, folder)
+    sampling, banks = config.pair_sampling(scans), training_banks(config, part, scans, folder)
     step = make_train_step(
         network.model,
         optimizer,
         network.loss,
-        drawing,
+        sampling,
         batch_size=settings.batch_size,
         seed=config.seed,
         average_decay=settings.average_decay,
         quick_compilation=settings.quick_compilation,
     )
-    validate = make_validation(config, banks.validation, drawing, scans.radius_mm)
-    state = init_state(network.model, optimizer, banks.validation, drawing, seed=config.seed)
+    validate = make_validation(config, banks.validation, sampling, scans.radius_mm)
+    state = init_state(network.model, optimizer, banks.validation, sampling, seed=config.seed)
     state = restore_or(folder.checkpoints, state, keep=settings.keep)
 
     with (
@@ -210,7 +210,7 @@ class Log:
 
 
 def make_validation(
-    config: Experiment, bank: Bank, drawing: Drawing, radius_mm: float
+    config: Experiment, bank: Bank, sampling: PairSampling, radius_mm: float
 ) -> Callable[[TrainState], dict[str, float]]:
     """Pose errors of the averaged weights on training entries, drawn with a key of their own.
 
@@ -226,7 +226,7 @@ def make_validation(
 
         def one(number: jax.Array) -> Metrics:
             draw_key, register_key = jax.random.split(jax.random.fold_in(key, number))
-            pairs = bank.draw(draw_key, entries[number][None], drawing)
+            pairs = bank.draw(draw_key, entries[number][None], sampling)
             source, truth = jax.tree.map(
                 lambda leaf: leaf[0], (pairs.source, pairs.target_from_source)
             )

@@ -138,7 +138,7 @@ def tune(
             results = register_views(
                 register,
                 bank,
-                experiment.make_drawing(scans),
+                experiment.pair_sampling(scans),
                 seed=experiment.seed,
                 unit_mm=scans.radius_mm,
                 progress=False,

@@ -47,7 +47,7 @@ def evaluation(bench: Bench) -> Iterator[Figure]:
                 )
                 times.append(json.loads(text))
     config = get_config()
-    model, sources = config.make_network().model, config.make_drawing(scans).num_source
+    model, sources = config.make_network().model, config.pair_sampling(scans).num_source
     targets, iterations = config.data.num_reference, config.model.test_iterations
     flops = inference_flops(model, sources, targets, iterations) + feature_flops(model, targets)
     limit = "arithmetic of an evaluation"
@@ -83,9 +83,9 @@ def measure(scans: ScanSet) -> dict[str, float]:
     """Seconds in this process: of the figures, of the registrations alone, of the pictures."""
     config = get_config()
     bank = make_bank(scans, num_reference=config.data.num_reference)
-    drawing = config.make_drawing(scans)
+    sampling = config.pair_sampling(scans)
     variables = init_state(
-        config.make_network().model, config.make_optimizer(), bank, drawing, seed=0
+        config.make_network().model, config.make_optimizer(), bank, sampling, seed=0
     ).variables
     part = config.make_part()
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):

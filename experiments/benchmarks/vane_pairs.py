@@ -13,7 +13,7 @@ from experiments.runner.experiment import Experiment
 from vanejax.cad.parametric_vane import guide_vane
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
 from vanejax.training.dataset import ScanSet, make_scan_set
-from vanejax.training.pairs import Drawing, Pair, ScanBank, draw_pairs, make_bank
+from vanejax.training.pairs import Pair, PairSampling, ScanBank, draw_pairs, make_bank
 from vanejax.training.train_step import TrainState, init_state, make_train_step
 
 SOURCES, TARGETS, NEIGHBORS = 717, 1024, 32
@@ -61,21 +61,21 @@ class VanePairs:
         return bank.replace(source_sizes=jnp.full_like(bank.source_sizes, self.sources))
 
     @property
-    def drawing(self) -> Drawing:
+    def sampling(self) -> PairSampling:
         """The recipe's, for these sizes."""
-        return Drawing(num_reference=self.targets, num_source=self.sources)
+        return PairSampling(num_reference=self.targets, num_source=self.sources)
 
     def pair(self, seed: int) -> Pair:
         """One pair with a reference of its own."""
         views = jnp.asarray([seed % len(AZIMUTHS_DEG)])
-        pairs = draw_pairs(jax.random.key(seed), self.bank, views, self.drawing)
+        pairs = draw_pairs(jax.random.key(seed), self.bank, views, self.sampling)
         first = jax.tree.map(lambda leaf: leaf[0], (pairs.source, pairs.target_from_source))
         return Pair(source=first[0], target=pairs.target, target_from_source=first[1])
 
     def state(self) -> TrainState:
         """Untrained."""
         model, optimizer = self.config.make_network().model, self.config.make_optimizer()
-        return init_state(model, optimizer, self.bank, self.drawing, seed=0)
+        return init_state(model, optimizer, self.bank, self.sampling, seed=0)
 
     def train_step(self):
         """The jitted step of training: ``state, metrics = step(state, bank)``."""
@@ -83,7 +83,7 @@ class VanePairs:
             self.config.make_network().model,
             self.config.make_optimizer(),
             self.config.make_network().loss,
-            self.drawing,
+            self.sampling,
             batch_size=self.batch,
             seed=0,
             average_decay=self.config.training.average_decay,

@@ -30,7 +30,7 @@ from vanejax.cad.part import Part, load_part
 from vanejax.errors import InputError
 from vanejax.scanner.camera import Camera, Viewpoints, hemisphere_viewpoints
 from vanejax.training.dataset import ScanSet
-from vanejax.training.pairs import Drawing, source_sizes
+from vanejax.training.pairs import PairSampling, source_sizes
 from vanejax.training.train_step import make_optimizer
 
 
@@ -173,9 +173,9 @@ class Experiment:
             formula=self.views.formula,
         )
 
-    def make_drawing(self, scans: ScanSet) -> Drawing:
+    def pair_sampling(self, scans: ScanSet) -> PairSampling:
         """How pairs are drawn; the rows of a source fit the view that sees most."""
-        return Drawing(
+        return PairSampling(
             num_reference=self.data.num_reference,
             num_source=int(source_sizes(scans, self.data.num_reference).max()),
             noise=self.data.noise,

@@ -12,7 +12,7 @@ from vanejax.scanner.sensor import Sensor, preset
 from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.training.dataset import ScanSet
 from vanejax.training.online_scans import RandomViews, ScanStream
-from vanejax.training.pairs import Drawing, make_bank
+from vanejax.training.pairs import PairSampling, make_bank
 
 _CASTINGS = 0xCA57  # folded into the seed: castings are drawn from another stream than scans
 
@@ -60,18 +60,18 @@ class EndlessSettings:
             raise InputError(f"config.endless.resolution={self.resolution!r} must lie in (0, 1]")
 
     def stream(
-        self, part: Part, scans: ScanSet, drawing: Drawing, *, batch_size: int, seed: int
+        self, part: Part, scans: ScanSet, sampling: PairSampling, *, batch_size: int, seed: int
     ) -> ScanStream:
         """The stream, with the thinned surface and the voxels of ``scans``."""
         return ScanStream(
             part=part,
-            reference=make_bank(scans, num_reference=drawing.num_reference).reference,
+            reference=make_bank(scans, num_reference=sampling.num_reference).reference,
             sensor=self.kind().scaled(self.resolution),
             views=RandomViews(distance_mm=self.distance_mm, elevation_deg=self.elevation_deg),
             castings=[Scanner(casting) for casting in self.cast(part, seed)],
             batch_size=batch_size,
-            num_reference=drawing.num_reference,
-            num_source=drawing.num_source,
+            num_reference=sampling.num_reference,
+            num_source=sampling.num_source,
             voxel_mm=float(scans.source["voxel_mm"]),
             seed=seed,
         )

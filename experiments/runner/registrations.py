@@ -14,7 +14,7 @@ from tqdm import tqdm
 from vanejax.matching.contract import Register, Registration
 from vanejax.matching.metrics import PoseErrors, SurfaceFit, pose_errors, surface_fit
 from vanejax.rigid import RigidTransform
-from vanejax.training.pairs import Drawing, Pair, ScanBank, draw_source, draw_target
+from vanejax.training.pairs import Pair, PairSampling, ScanBank, draw_source, draw_target
 
 TEST_STREAM = 0x7E57  # folded into key(seed): training and validation draw from other keys
 
@@ -43,7 +43,7 @@ class Results:
 def register_views(
     register: Register,
     bank: ScanBank,
-    drawing: Drawing,
+    sampling: PairSampling,
     *,
     seed: int,
     unit_mm: float,
@@ -57,7 +57,7 @@ def register_views(
     Args:
       register: any method; jitted already if it should be.
       bank: V views.
-      drawing: as in training.
+      sampling: as in training.
       seed: of the pairs.
       unit_mm: length of the unit-sphere unit, the part's radius.
       progress: whether to show a progress bar.
@@ -68,7 +68,7 @@ def register_views(
     views = range(bank.scans.mask.shape[0])
     for view in tqdm(views, "evaluating", unit="view", disable=not progress):
         draw_key, register_key = jax.random.split(jax.random.fold_in(stream, view))
-        pair = jax.block_until_ready(_draw(draw_key, bank, jnp.asarray(view), drawing))
+        pair = jax.block_until_ready(_draw(draw_key, bank, jnp.asarray(view), sampling))
         if view == 0:  # compiles
             jax.block_until_ready(register(pair.source, pair.target, init, register_key))
         start = time.perf_counter()
@@ -82,11 +82,11 @@ def register_views(
 # jitted here, not in the function: another evaluation in this process compiles nothing
 
 
-@functools.partial(jax.jit, static_argnames="drawing")
-def _draw(key: jax.Array, bank: ScanBank, view: jax.Array, drawing: Drawing) -> Pair:
+@functools.partial(jax.jit, static_argnames="sampling")
+def _draw(key: jax.Array, bank: ScanBank, view: jax.Array, sampling: PairSampling) -> Pair:
     target_key, source_key = jax.random.split(key)
-    source, truth = draw_source(source_key, bank, view, drawing)
-    target = draw_target(target_key, bank, drawing)
+    source, truth = draw_source(source_key, bank, view, sampling)
+    target = draw_target(target_key, bank, sampling)
     return Pair(source=source, target=target, target_from_source=truth)
 
 

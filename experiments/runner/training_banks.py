@@ -45,8 +45,10 @@ def training_banks(
     if not config.endless.sensor:
         return _fixed(make_bank(scans.train, num_reference=config.data.num_reference))
     settings, training = config.endless, config.training
-    drawing = config.make_drawing(scans)
-    stream = settings.stream(part, scans, drawing, batch_size=training.batch_size, seed=config.seed)
+    sampling = config.pair_sampling(scans)
+    stream = settings.stream(
+        part, scans, sampling, batch_size=training.batch_size, seed=config.seed
+    )
     print(f"training on new scans by {settings.sensor} for every step")
     return TrainingBanks(
         validation=stream.for_validation(training.validation_pairs),

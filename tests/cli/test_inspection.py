@@ -258,9 +258,9 @@ def test_real_scans_and_their_parts():
 
 def test_weights(tmp_path, monkeypatch):
     np.savez(tmp_path / "w.npz", header=np.zeros(7, np.uint8), kernel=np.zeros((2, 2)))
-    drawing = SimpleNamespace(num_reference=1024, num_source=717)
+    sampling = SimpleNamespace(num_reference=1024, num_source=717)
     matcher = SimpleNamespace(
-        part_name="vane", part_sha256="ab" * 32, radius_mm=75.0, drawing=drawing, iterations=5
+        part_name="vane", part_sha256="ab" * 32, radius_mm=75.0, sampling=sampling, iterations=5
     )
     monkeypatch.setattr("vanejax.training.weight_file.load_model", lambda path: matcher)
     found = check(inspect(tmp_path / "w.npz"))

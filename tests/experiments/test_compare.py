@@ -207,7 +207,7 @@ def test_success_needs_both_errors_and_what_is_not_finite_is_none(report: dict) 
     results = register_views(
         still,
         make_bank(scans.test, num_reference=experiment.data.num_reference),
-        experiment.make_drawing(scans),
+        experiment.pair_sampling(scans),
         seed=0,
         unit_mm=scans.radius_mm,
         progress=False,

@@ -78,7 +78,7 @@ def register(method, config: Experiment, scans: ScanSet, bank: ScanBank) -> Resu
     return register_views(
         method,
         bank,
-        config.make_drawing(scans),
+        config.pair_sampling(scans),
         seed=config.seed,
         unit_mm=scans.radius_mm,
         progress=False,
@@ -153,9 +153,9 @@ def test_a_method_that_always_fails_has_no_figures(
 def test_evaluate_writes_json_and_pictures(
     config: Experiment, scans: ScanSet, bank: ScanBank, tmp_path: Path, capsys
 ) -> None:
-    model, drawing = config.make_network().model, config.make_drawing(scans)
+    model, sampling = config.make_network().model, config.pair_sampling(scans)
     key = jax.random.key(0)
-    source, _ = draw_source(key, bank, jnp.asarray(0), drawing)
+    source, _ = draw_source(key, bank, jnp.asarray(0), sampling)
     variables = jax.jit(model.init, static_argnums=4)(
         key, source, source, RigidTransform.identity(), 1
     )

@@ -46,7 +46,7 @@ def test_a_part_turned_over_counts_once_and_what_is_not_finite_as_that() -> None
 def test_the_best_cell_wins_on_training_views_alone(monkeypatch, tmp_path: Path, capsys) -> None:
     seen = []
 
-    def register_views(register, bank, drawing, **rest: object) -> SimpleNamespace:
+    def register_views(register, bank, sampling, **rest: object) -> SimpleNamespace:
         seen.append(bank.size)
         error = register["icp.max_distance"]
         return SimpleNamespace(
@@ -75,7 +75,7 @@ def test_the_best_cell_wins_on_training_views_alone(monkeypatch, tmp_path: Path,
 def test_no_pair_is_drawn_from_a_test_view(monkeypatch, tmp_path: Path) -> None:
     banks = []
 
-    def register_views(register, bank, drawing, **rest: object) -> SimpleNamespace:
+    def register_views(register, bank, sampling, **rest: object) -> SimpleNamespace:
         banks.append(bank)
         errors = SimpleNamespace(rotation_deg=np.ones(2), translation_mm=np.ones(2))
         return SimpleNamespace(errors=errors, time_s=np.ones(2))

@@ -38,7 +38,7 @@ from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, look_at
 from vanejax.scans.measured_scan import clean_scan
 from vanejax.scans.scan_file import save_points
-from vanejax.training.pairs import Drawing
+from vanejax.training.pairs import PairSampling
 from vanejax.training.weight_file import TrainedMatcher
 
 
@@ -330,7 +330,7 @@ def a_matcher(part: Part) -> TrainedMatcher:
         model=None,
         variables={},
         iterations=1,
-        drawing=Drawing(),
+        sampling=PairSampling(),
         voxel_mm=1.0,
         center=part.center,
         radius_mm=part.radius,

@@ -24,7 +24,7 @@ from vanejax.pointcloud import PointCloud, voxel_thin
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera
 from vanejax.scans.measured_scan import clean_scan
-from vanejax.training.pairs import Drawing
+from vanejax.training.pairs import PairSampling
 from vanejax.training.weight_file import TrainedMatcher
 
 MODEL = RpmNet(num_neighbors=8, radius=0.5, sinkhorn_iterations=2, feature_width=8)
@@ -35,10 +35,10 @@ def _matcher(voxel_mm: float = 4.0) -> TrainedMatcher:
     part = vane()
     points, normals, _ = part.sample(8000, seed=0)
     thinned = voxel_thin(points, voxel_mm=voxel_mm)
-    drawing = Drawing(num_reference=128, num_source=96)
+    sampling = PairSampling(num_reference=128, num_source=96)
     cloud = PointCloud.create(
-        np.zeros((drawing.num_reference, 3), np.float32),
-        np.zeros((drawing.num_reference, 3), np.float32),
+        np.zeros((sampling.num_reference, 3), np.float32),
+        np.zeros((sampling.num_reference, 3), np.float32),
     )
     shapes = jax.eval_shape(
         lambda *args: MODEL.init(*args, 1),
@@ -53,7 +53,7 @@ def _matcher(voxel_mm: float = 4.0) -> TrainedMatcher:
         model=MODEL,
         variables=variables,
         iterations=2,
-        drawing=drawing,
+        sampling=sampling,
         voxel_mm=voxel_mm,
         center=part.center,
         radius_mm=part.radius,

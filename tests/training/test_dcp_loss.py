@@ -17,7 +17,7 @@ from vanejax.matching.metrics import rotation_error_deg
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.training.dcp_loss import DcpLoss, cycle_loss, rotation_loss, translation_loss
-from vanejax.training.pairs import Drawing, Pair, draw_pose
+from vanejax.training.pairs import Pair, PairSampling, draw_pose
 
 N, M, B = 12, 15, 3
 MODEL = Dcp(width=16, num_neighbors=4, heads=2, hidden=16)
@@ -151,11 +151,11 @@ def test_a_small_network_learns_one_shape():
     xyz *= (0.6 + 0.25 * np.sin(4 * xyz[:, :1])) / np.linalg.norm(xyz, axis=1, keepdims=True)
     xyz = jnp.asarray(xyz * [1.0, 0.7, 0.4], jnp.float32)
     target = PointCloud.create(xyz, xyz)
-    drawing = Drawing(max_rotation_deg=30.0, max_translation=0.1)
+    sampling = PairSampling(max_rotation_deg=30.0, max_translation=0.1)
     loss, optimizer = DcpLoss(matching=0.1, matching_sigma=0.1), optax.adam(1e-3)
 
     def pairs(key) -> Pair:
-        poses = jax.vmap(lambda key: draw_pose(key, drawing))(jax.random.split(key, 4))
+        poses = jax.vmap(lambda key: draw_pose(key, sampling))(jax.random.split(key, 4))
         sources = jax.vmap(target.transform)(poses)
         return Pair(source=sources, target=target, target_from_source=poses.inverse())
 

@@ -113,7 +113,7 @@ def test_an_export_holds_the_run(
     matcher: TrainedMatcher, config: Experiment, scans: ScanSet, part: Part, workdir: Path
 ) -> None:
     assert matcher.model == config.make_network().model
-    assert matcher.drawing == config.make_drawing(scans)
+    assert matcher.sampling == config.pair_sampling(scans)
     assert matcher.iterations == config.model.test_iterations
     assert matcher.voxel_mm == config.data.voxel_mm
     assert matcher.camera == config.make_camera()

@@ -18,7 +18,7 @@ from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Viewpoints
 from vanejax.training.dataset import ScanSet
 from vanejax.training.pairs import (
-    Drawing,
+    PairSampling,
     draw_pairs,
     draw_pose,
     draw_subset,
@@ -30,10 +30,10 @@ from vanejax.training.pairs import (
 COUNTS = np.array([60, 45, 30, 10])
 NUM_REFERENCE, SURFACE = 64, 100
 CENTER, RADIUS_MM = np.array([3.0, -7.0, 40.0]), 50.0
-CLEAN = Drawing(num_reference=NUM_REFERENCE, num_source=40, noise=0.0)
+CLEAN = PairSampling(num_reference=NUM_REFERENCE, num_source=40, noise=0.0)
 VIEWS = jnp.array([2, 0, 3, 1, 0])
 
-draw = jax.jit(draw_pairs, static_argnames="drawing")
+draw = jax.jit(draw_pairs, static_argnames="sampling")
 
 
 def surface(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -76,8 +76,8 @@ def bank():
 
 
 @functools.cache
-def pairs(drawing: Drawing = CLEAN, seed: int = 0):
-    return jax.tree.map(np.asarray, draw(jax.random.key(seed), bank(), VIEWS, drawing))
+def pairs(sampling: PairSampling = CLEAN, seed: int = 0):
+    return jax.tree.map(np.asarray, draw(jax.random.key(seed), bank(), VIEWS, sampling))
 
 
 def rows_of(points: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -155,9 +155,9 @@ def test_the_same_key_gives_the_same_pair_and_another_one_another():
 
 
 def test_poses_fill_their_limits():
-    drawing = dataclasses.replace(CLEAN, max_rotation_deg=30.0, max_translation=0.2)
+    sampling = dataclasses.replace(CLEAN, max_rotation_deg=30.0, max_translation=0.2)
     keys = jax.random.split(jax.random.key(0), 4000)
-    poses = jax.jit(jax.vmap(lambda key: draw_pose(key, drawing)))(keys)
+    poses = jax.jit(jax.vmap(lambda key: draw_pose(key, sampling)))(keys)
     angles = np.degrees(rotation_angle(poses.rotation))
     assert angles.max() <= 30 + 1e-4  # f32 eps x 1000
     # uniform: each tenth of the range holds a tenth, to 5 standard deviations of 19
@@ -177,20 +177,20 @@ def test_noise_has_its_width_and_its_clip():
     cloud = PointCloud(
         xyz=jnp.ones((20_000, 3)), normals=jnp.ones((20_000, 3)), mask=jnp.arange(20_000) < 19_990
     )
-    drawing = dataclasses.replace(CLEAN, noise=0.01, noise_clip=0.05)
-    noisy = jitter(jax.random.key(0), cloud, drawing)
+    sampling = dataclasses.replace(CLEAN, noise=0.01, noise_clip=0.05)
+    noisy = jitter(jax.random.key(0), cloud, sampling)
     noise = np.asarray(noisy.xyz - cloud.xyz)
     np.testing.assert_array_equal(noise[19_990:], 0)
     np.testing.assert_array_equal(noisy.normals, cloud.normals)
     # 60,000 numbers: five standard errors
     np.testing.assert_allclose(noise.mean(axis=0), 0, atol=5 * 0.01 / np.sqrt(20_000))
     np.testing.assert_allclose(noise.std(), 0.01, rtol=5 / np.sqrt(120_000))
-    clipped = jitter(jax.random.key(0), cloud, dataclasses.replace(drawing, noise_clip=0.01))
+    clipped = jitter(jax.random.key(0), cloud, dataclasses.replace(sampling, noise_clip=0.01))
     clipped = np.asarray(clipped.xyz - cloud.xyz)[:19_990]
     assert np.abs(clipped).max() <= 0.01 + 1e-6  # rounding of 1 + 0.01
     outside = np.mean(np.abs(clipped) > 0.01 - 1e-6)
     np.testing.assert_allclose(outside, 0.3173, atol=0.01)  # beyond one standard deviation
-    other = np.asarray(jitter(jax.random.key(1), cloud, drawing).xyz - cloud.xyz)
+    other = np.asarray(jitter(jax.random.key(1), cloud, sampling).xyz - cloud.xyz)
     assert abs(np.corrcoef(noise[:, 0], other[:, 0])[0, 1]) < 5 / np.sqrt(20_000)
 
 

@@ -16,7 +16,7 @@ from vanejax.matching.baselines.pointnetlk import PointNetLK
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.training import loss_terms as losses
-from vanejax.training.pairs import Drawing, Pair, draw_pose
+from vanejax.training.pairs import Pair, PairSampling, draw_pose
 from vanejax.training.pointnet_losses import PcrNetLoss, PointNetLKLoss, chamfer_loss, matrix_loss
 
 B, N, M = 4, 32, 40
@@ -46,8 +46,8 @@ def draw(key: jax.Array, count: int = B) -> Pair:
     xyz = np.random.default_rng(0).normal(size=(M, 3))
     xyz *= [0.9, 0.6, 0.35] / np.linalg.norm(xyz, axis=-1, keepdims=True)
     xyz *= 1 + 0.25 * np.sin(4 * xyz[:, :1] + 1)
-    drawing = Drawing(max_rotation_deg=30.0, max_translation=0.2)
-    truth = jax.vmap(lambda key: draw_pose(key, drawing))(jax.random.split(key, count))
+    sampling = PairSampling(max_rotation_deg=30.0, max_translation=0.2)
+    truth = jax.vmap(lambda key: draw_pose(key, sampling))(jax.random.split(key, count))
     target = cloud(xyz, M - 5)
     source = cloud(np.broadcast_to(xyz[:N], (count, N, 3)), N - 5)
     return Pair(

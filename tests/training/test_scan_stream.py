@@ -19,7 +19,7 @@ from vanejax.scanner.camera import Camera
 from vanejax.scanner.sensor import Sensor, preset
 from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.training.online_scans import RandomViews, ScanStream
-from vanejax.training.pairs import Drawing, draw_pairs
+from vanejax.training.pairs import PairSampling, draw_pairs
 
 CENTER = np.array([30.0, -20.0, 10.0])
 HALF = np.array([40.0, 25.0, 15.0])
@@ -116,9 +116,9 @@ def test_validation_is_never_trained_on(stream):
 
 
 def test_every_step_has_the_same_shapes_and_compiles_once(stream):
-    drawing = Drawing(num_reference=256, num_source=200, noise=0.0)
+    sampling = PairSampling(num_reference=256, num_source=200, noise=0.0)
     # a function of its own: other tests jit `draw_pairs` too, and would share its cache
-    draw = jax.jit(lambda key, bank: draw_pairs(key, bank, jnp.arange(3), drawing))
+    draw = jax.jit(lambda key, bank: draw_pairs(key, bank, jnp.arange(3), sampling))
     for step in range(3):
         pairs = draw(jax.random.key(step), stream.of_step(step))
         # the label takes every source back onto the part

@@ -13,11 +13,11 @@ import pytest
 from vanejax.errors import InputError
 from vanejax.matching.se3 import rotation_angle
 from vanejax.pointcloud import PointCloud
-from vanejax.training.pairs import Drawing, Pair
+from vanejax.training.pairs import Pair, PairSampling
 from vanejax.training.shape_pairs import ShapeBank, crop, draw_shape_pairs
 
 POINTS, WHOLE, ROWS, BATCH = 200, 100, 70, 3
-CLEAN = Drawing(
+CLEAN = PairSampling(
     num_reference=WHOLE, num_source=8, noise=0.0, max_rotation_deg=20.0, max_translation=0.1
 )
 
@@ -35,17 +35,17 @@ def bank() -> ShapeBank:
     return ShapeBank(jnp.asarray(points, jnp.float32), jnp.asarray(normals, jnp.float32))
 
 
-def pairs(index: int = 1, drawing: Drawing = CLEAN, seed: int = 0) -> Pair:
-    drawn = draw(bank(), jax.random.key(seed), jnp.array([index, 0, 2]), drawing)
+def pairs(index: int = 1, sampling: PairSampling = CLEAN, seed: int = 0) -> Pair:
+    drawn = draw(bank(), jax.random.key(seed), jnp.array([index, 0, 2]), sampling)
     return jax.tree.map(np.asarray, drawn)
 
 
-def shapes_of(drawing: Drawing, points: int, **options) -> Pair:
+def shapes_of(sampling: PairSampling, points: int, **options) -> Pair:
     """A pair's shapes; nothing is compiled."""
     zeros = jnp.zeros((1, points, 3))
     return jax.eval_shape(
         lambda key: draw_shape_pairs(
-            key, ShapeBank(zeros, zeros), jnp.int32(0), BATCH, drawing, **options
+            key, ShapeBank(zeros, zeros), jnp.int32(0), BATCH, sampling, **options
         ),
         jax.random.key(0),
     )
@@ -156,12 +156,12 @@ def test_order_says_nothing():
 
 
 def test_sizes():
-    published = shapes_of(Drawing(), 2048)
+    published = shapes_of(PairSampling(), 2048)
     assert published.source.xyz.shape == (BATCH, 717, 3)
     assert published.source.mask.shape == (BATCH, 717)
     assert published.target.xyz.shape == (717, 3)
     assert published.target_from_source.rotation.shape == (BATCH, 3, 3)
-    whole = shapes_of(Drawing(), 1024, crop_target=False)
+    whole = shapes_of(PairSampling(), 1024, crop_target=False)
     assert whole.target.xyz.shape == (1024, 3)
     assert whole.source.xyz.shape == (BATCH, 717, 3)
     assert shapes_of(CLEAN, POINTS, keep=0.5).source.xyz.shape == (BATCH, 50, 3)
@@ -170,7 +170,7 @@ def test_sizes():
 
 
 def test_both_clouds_are_noisy_and_the_label_is_not():
-    noisy, clean = pairs(drawing=dataclasses.replace(CLEAN, noise=0.01)), pairs()
+    noisy, clean = pairs(sampling=dataclasses.replace(CLEAN, noise=0.01)), pairs()
     jax.tree.map(np.testing.assert_array_equal, noisy.target_from_source, clean.target_from_source)
     np.testing.assert_array_equal(noisy.source.normals, clean.source.normals)
     gaps = [noisy.target.xyz - clean.target.xyz]
@@ -202,7 +202,7 @@ def test_the_same_key_gives_the_same_pairs_and_another_one_others():
 
 def test_what_cannot_be_drawn():
     with pytest.raises(InputError, match="1023 points each, 1024 are wanted"):
-        shapes_of(Drawing(), 1023)
+        shapes_of(PairSampling(), 1023)
     for keep in (0.0, 1.5):
         with pytest.raises(InputError, match="take 0 < keep <= 1"):
             shapes_of(CLEAN, POINTS, keep=keep)

@@ -18,7 +18,7 @@ from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.training import loss_terms as losses
 from vanejax.training import train_step as training
-from vanejax.training.pairs import Drawing, Pair, ScanBank
+from vanejax.training.pairs import Pair, PairSampling, ScanBank
 from vanejax.training.rpmnet_loss import RpmNetLoss
 from vanejax.training.train_step import init_state, make_optimizer, make_train_step, views_of_step
 
@@ -58,7 +58,7 @@ def make_match(source: PointCloud, target: PointCloud, twist: jax.Array) -> Matc
     )
 
 
-DRAWING = Drawing(num_reference=24, num_source=16)
+SAMPLING = PairSampling(num_reference=24, num_source=16)
 MODEL = Twist()
 OPTIMIZER = make_optimizer(learning_rate=1e-3, steps=100, warmup_steps=0, clip_norm=1.0)
 LOSS = RpmNetLoss(iterations=1, matching=0.05, partner=0.5)
@@ -82,12 +82,12 @@ def bank() -> ScanBank:
     return ScanBank(scans=scans, source_sizes=jnp.array([12, 13, 14, 15, 16]), reference=reference)
 
 
-step = make_train_step(MODEL, OPTIMIZER, LOSS, DRAWING, batch_size=2, seed=7, average_decay=DECAY)
+step = make_train_step(MODEL, OPTIMIZER, LOSS, SAMPLING, batch_size=2, seed=7, average_decay=DECAY)
 
 
 @functools.cache
 def first_state():
-    return on_host(init_state(MODEL, OPTIMIZER, bank(), DRAWING, seed=7))
+    return on_host(init_state(MODEL, OPTIMIZER, bank(), SAMPLING, seed=7))
 
 
 def start():
@@ -119,7 +119,7 @@ def assert_bit_equal(a, b) -> None:
 
 def test_a_run_is_a_function_of_its_seed():
     states, metrics = run()
-    state = init_state(MODEL, OPTIMIZER, bank(), DRAWING, seed=7)
+    state = init_state(MODEL, OPTIMIZER, bank(), SAMPLING, seed=7)
     assert_bit_equal(on_host(state), states[0])
     for expected, measured in zip(states[1:], metrics, strict=True):
         state, again = step(state, bank())
@@ -147,7 +147,7 @@ def test_each_step_draws_anew():
 
 
 def test_another_seed_starts_elsewhere():
-    other = init_state(MODEL, OPTIMIZER, bank(), DRAWING, seed=8)
+    other = init_state(MODEL, OPTIMIZER, bank(), SAMPLING, seed=8)
     twists = [state.variables["params"]["twist"] for state in (other, run()[0][0])]
     assert np.abs(np.subtract(*twists)).max() > 0.01
 
@@ -312,7 +312,7 @@ def test_the_loss_discounts_early_iterations_and_shares_the_reference():
 
 def test_quick_compilation_changes_rounding_only(monkeypatch):
     """And is left alone where XLA knows no such option."""
-    arguments = (MODEL, OPTIMIZER, LOSS, DRAWING)
+    arguments = (MODEL, OPTIMIZER, LOSS, SAMPLING)
     settings = {"batch_size": 2, "seed": 7, "average_decay": DECAY}
     expected, metrics = step(start(), bank())
     for known in (True, False):

@@ -291,7 +291,7 @@ def _inspect_weights(path: Path, arrays: dict[str, str]) -> Inspection:
     notes = (
         f"trained for the part {matcher.part_name} (sha256 {matcher.part_sha256[:12]}), radius "
         f"{matcher.radius_mm:.4g} mm",
-        f"{matcher.drawing.num_reference:,} reference and up to {matcher.drawing.num_source:,} "
+        f"{matcher.sampling.num_reference:,} reference and up to {matcher.sampling.num_source:,} "
         f"source points, {matcher.iterations} iterations",
     )
     return Inspection(

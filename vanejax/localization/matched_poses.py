@@ -123,15 +123,15 @@ def _source(
         None if scan.normals is None else scan.normals[subset(scan.points, THINNED_FROM, seed)]
     )
     thinned = voxel_thin(points, voxel_mm=matcher.voxel_mm)
-    drawing = matcher.drawing
-    wanted = round(drawing.num_reference * len(thinned) / len(matcher.reference_points))
-    chosen = thinned[subset(thinned, int(np.clip(wanted, 16, drawing.num_source)), seed + 1)]
+    sampling = matcher.sampling
+    wanted = round(sampling.num_reference * len(thinned) / len(matcher.reference_points))
+    chosen = thinned[subset(thinned, int(np.clip(wanted, 16, sampling.num_source)), seed + 1)]
     if normals is None or scan.sensor_origin is None:
         normals = estimate_normals(points, sensor_origin=scan.sensor_origin, at=chosen)
     else:
         normals = normals[chosen]
     middle = points[chosen].mean(axis=0)
-    rows = drawing.num_source
+    rows = sampling.num_source
     xyz, unit = np.zeros((rows, 3), np.float32), np.zeros((rows, 3), np.float32)
     xyz[: len(chosen)] = (points[chosen] - middle) / matcher.radius_mm
     unit[: len(chosen)] = normals
@@ -141,7 +141,7 @@ def _source(
 
 def _reference(matcher: TrainedMatcher, seed: int) -> PointCloud:
     """The part as the network takes it: [num_reference] points of its thinned surface."""
-    chosen = subset(matcher.reference_points, matcher.drawing.num_reference, seed)
+    chosen = subset(matcher.reference_points, matcher.sampling.num_reference, seed)
     xyz = (matcher.reference_points[chosen] - matcher.center) / matcher.radius_mm
     return PointCloud.create(
         jnp.asarray(xyz, jnp.float32), jnp.asarray(matcher.reference_normals[chosen], jnp.float32)

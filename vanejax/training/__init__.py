@@ -6,7 +6,7 @@ In: a `ScanSet` (virtual scans with labels) and a network. Out: a pure training 
 
 from vanejax.training.checkpoint import Checkpoints, restore_or
 from vanejax.training.dataset import ScanSet, load_scan_set, make_scan_set
-from vanejax.training.pairs import Drawing, Pair, draw_pairs, make_bank
+from vanejax.training.pairs import Pair, PairSampling, draw_pairs, make_bank
 from vanejax.training.pretrained import find_weights
 from vanejax.training.rpmnet_loss import RpmNetLoss
 from vanejax.training.train_step import TrainState, init_state, make_optimizer, make_train_step
@@ -14,8 +14,8 @@ from vanejax.training.weight_file import TrainedMatcher, load_model, save_model
 
 __all__ = [
     "Checkpoints",
-    "Drawing",
     "Pair",
+    "PairSampling",
     "RpmNetLoss",
     "ScanSet",
     "TrainState",

@@ -15,7 +15,7 @@ from vanejax.matching.rpmnet import RpmNet
 from vanejax.scanner.camera import Camera
 from vanejax.training.checkpoint import Checkpoints
 from vanejax.training.dataset import ScanSet, load_scan_set
-from vanejax.training.pairs import Drawing, source_sizes
+from vanejax.training.pairs import PairSampling, source_sizes
 from vanejax.training.train_step import TrainState, make_optimizer
 from vanejax.training.weight_file import (
     TrainedMatcher,
@@ -67,7 +67,7 @@ def export_workdir(
                 f"{workdir} is a run of {name!r}: register takes the weights of an RPM-Net"
             )
         model = model_from_dict(settings, str(record))
-        drawing = _drawing(config["data"], scans)
+        sampling = _sampling(config["data"], scans)
         voxel_mm = config["data"]["voxel_mm"]
         camera = Camera.from_dict(scans.source["camera"])
     except (KeyError, TypeError) as error:
@@ -79,7 +79,7 @@ def export_workdir(
         model=model,
         variables=variables,
         iterations=iterations,
-        drawing=drawing,
+        sampling=sampling,
         voxel_mm=voxel_mm,
         center=scans.center,
         radius_mm=scans.radius_mm,
@@ -105,12 +105,12 @@ def _evaluation(path: Path) -> dict[str, Any] | None:
     return {name: found[name] for name in ("views", "summary", "date") if name in found}
 
 
-def _drawing(data: dict[str, Any], scans: ScanSet) -> Drawing:
+def _sampling(data: dict[str, Any], scans: ScanSet) -> PairSampling:
     names = ("num_reference", "noise", "noise_clip", "max_rotation_deg", "max_translation")
     settings = {name: data[name] for name in names}
     # the rows of a source fit the view that sees most, as in training
     rows = int(source_sizes(scans, settings["num_reference"]).max())
-    return Drawing(num_source=rows, **settings)
+    return PairSampling(num_source=rows, **settings)
 
 
 def _read_weights(workdir: Path, model: RpmNet, checkpoint: Which) -> tuple[Any, int]:

@@ -93,7 +93,7 @@ class ScanStream:
         that differ from it.
       batch_size: B, scans in a step.
       num_reference, num_source: M points of the reference and rows N of a source, as in
-        `vanejax.training.pairs.Drawing`; a scan has M X / Y points, at most N.
+        `vanejax.training.pairs.PairSampling`; a scan has M X / Y points, at most N.
       voxel_mm: thinning, as that of the reference.
       seed: of everything.
     """

@@ -55,9 +55,9 @@ class ScanBank:
         """V, the number of views."""
         return self.scans.mask.shape[0]
 
-    def draw(self, key: jax.Array, views: jax.Array, drawing: Drawing) -> Pair:
+    def draw(self, key: jax.Array, views: jax.Array, sampling: PairSampling) -> Pair:
         """`draw_pairs` of these views [B] i32."""
-        return draw_pairs(key, self, views, drawing)
+        return draw_pairs(key, self, views, sampling)
 
 
 class Bank(Protocol):
@@ -68,13 +68,13 @@ class Bank(Protocol):
         """How many entries there are."""
         ...
 
-    def draw(self, key: jax.Array, entries: jax.Array, drawing: Drawing) -> Pair:
+    def draw(self, key: jax.Array, entries: jax.Array, sampling: PairSampling) -> Pair:
         """A batch from the entries [B] i32: sources [B, N] that share one target [M]."""
         ...
 
 
 @dataclasses.dataclass(frozen=True)
-class Drawing:
+class PairSampling:
     """How pairs are drawn; the defaults are the paper's.
 
     Attributes:
@@ -143,48 +143,48 @@ def draw_subset(key: jax.Array, cloud: PointCloud, size: jax.Array, rows: int) -
     )
 
 
-def jitter(key: jax.Array, cloud: PointCloud, drawing: Drawing) -> PointCloud:
+def jitter(key: jax.Array, cloud: PointCloud, sampling: PairSampling) -> PointCloud:
     """Adds clipped Gaussian noise to the points; normals stay, as in the paper's protocol."""
-    noise = drawing.noise * jax.random.normal(key, cloud.xyz.shape)
-    noise = jnp.clip(noise, -drawing.noise_clip, drawing.noise_clip)
+    noise = sampling.noise * jax.random.normal(key, cloud.xyz.shape)
+    noise = jnp.clip(noise, -sampling.noise_clip, sampling.noise_clip)
     return cloud.replace(xyz=cloud.xyz + jnp.where(cloud.mask[:, None], noise, 0.0))
 
 
-def draw_pose(key: jax.Array, drawing: Drawing) -> RigidTransform:
-    """A random rigid motion of at most the drawing's rotation and translation."""
+def draw_pose(key: jax.Array, sampling: PairSampling) -> RigidTransform:
+    """A random rigid motion of at most the sampling's rotation and translation."""
     axis_key, angle_key, translation_key = jax.random.split(key, 3)
     axis = jax.random.normal(axis_key, (3,))
     axis = axis / jnp.linalg.norm(axis)
-    angle = jnp.deg2rad(drawing.max_rotation_deg) * jax.random.uniform(angle_key)
-    limit = drawing.max_translation
+    angle = jnp.deg2rad(sampling.max_rotation_deg) * jax.random.uniform(angle_key)
+    limit = sampling.max_translation
     translation = jax.random.uniform(translation_key, (3,), minval=-limit, maxval=limit)
     return RigidTransform(rotation=exp_so3(axis * angle), translation=translation)
 
 
-def draw_target(key: jax.Array, bank: ScanBank, drawing: Drawing) -> PointCloud:
+def draw_target(key: jax.Array, bank: ScanBank, sampling: PairSampling) -> PointCloud:
     """A noisy reference [M]: one serves a whole batch of views."""
     subset_key, noise_key = jax.random.split(key)
-    size = jnp.asarray(drawing.num_reference)
+    size = jnp.asarray(sampling.num_reference)
     return jitter(
-        noise_key, draw_subset(subset_key, bank.reference, size, drawing.num_reference), drawing
+        noise_key, draw_subset(subset_key, bank.reference, size, sampling.num_reference), sampling
     )
 
 
 def draw_source(
-    key: jax.Array, bank: ScanBank, view: jax.Array, drawing: Drawing
+    key: jax.Array, bank: ScanBank, view: jax.Array, sampling: PairSampling
 ) -> tuple[PointCloud, RigidTransform]:
     """A noisy source [N] of one view, moved by a random pose, and its target_from_source."""
     subset_key, noise_key, pose_key = jax.random.split(key, 3)
     scan = jax.tree.map(lambda leaf: leaf[view], bank.scans)
-    subset = draw_subset(subset_key, scan, bank.source_sizes[view], drawing.num_source)
-    source_from_target = draw_pose(pose_key, drawing)
-    moved = jitter(noise_key, subset, drawing).transform(source_from_target)
+    subset = draw_subset(subset_key, scan, bank.source_sizes[view], sampling.num_source)
+    source_from_target = draw_pose(pose_key, sampling)
+    moved = jitter(noise_key, subset, sampling).transform(source_from_target)
     # Padding moves with the rest, then goes back to zero: it must stay finite, nothing more.
     moved = moved.replace(xyz=jnp.where(moved.mask[:, None], moved.xyz, 0.0))
     return moved, source_from_target.inverse()
 
 
-def draw_pairs(key: jax.Array, bank: ScanBank, views: jax.Array, drawing: Drawing) -> Pair:
+def draw_pairs(key: jax.Array, bank: ScanBank, views: jax.Array, sampling: PairSampling) -> Pair:
     """A batch that shares one reference.
 
     Returns:
@@ -192,11 +192,11 @@ def draw_pairs(key: jax.Array, bank: ScanBank, views: jax.Array, drawing: Drawin
     """
     target_key, source_key = jax.random.split(key)
     keys = jax.random.split(source_key, views.shape[0])
-    source, target_from_source = jax.vmap(lambda k, v: draw_source(k, bank, v, drawing))(
+    source, target_from_source = jax.vmap(lambda k, v: draw_source(k, bank, v, sampling))(
         keys, views
     )
     return Pair(
         source=source,
-        target=draw_target(target_key, bank, drawing),
+        target=draw_target(target_key, bank, sampling),
         target_from_source=target_from_source,
     )

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from vanejax.errors import InputError
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
-from vanejax.training.pairs import Drawing, Pair, draw_pose, draw_subset, jitter
+from vanejax.training.pairs import Pair, PairSampling, draw_pose, draw_subset, jitter
 
 KEPT_SHARE = 0.7
 """Of a cloud's points, what cropping leaves: the published share."""
@@ -38,13 +38,13 @@ class ShapeBank:
         """S, the number of shapes."""
         return self.points.shape[0]
 
-    def draw(self, key: jax.Array, entries: jax.Array, drawing: Drawing) -> Pair:
+    def draw(self, key: jax.Array, entries: jax.Array, sampling: PairSampling) -> Pair:
         """`draw_shape_pairs` of the first of these shapes [B] i32, with B sources.
 
         A batch shares its target, so it is of one shape; where entries come in random order, so do
         the shapes.
         """
-        return draw_shape_pairs(key, self, entries[0], entries.shape[0], drawing)
+        return draw_shape_pairs(key, self, entries[0], entries.shape[0], sampling)
 
 
 def crop(key: jax.Array, cloud: PointCloud, rows: int) -> PointCloud:
@@ -65,7 +65,7 @@ def draw_shape_pairs(
     bank: ShapeBank,
     index: jax.Array,
     batch_size: int,
-    drawing: Drawing,
+    sampling: PairSampling,
     *,
     keep: float = KEPT_SHARE,
     crop_target: bool = True,
@@ -75,7 +75,7 @@ def draw_shape_pairs(
     Args:
       index: [] i32, which shape.
       batch_size: B.
-      drawing: ``num_reference`` points are drawn for either cloud, then cropped; ``num_source``
+      sampling: ``num_reference`` points are drawn for either cloud, then cropped; ``num_source``
         has no say.
       keep: share of the points that cropping leaves, above 0 and at most 1.
       crop_target: whether the target loses a part too, as published. The crop of the target and of
@@ -89,7 +89,7 @@ def draw_shape_pairs(
     Raises:
       InputError: the shapes have fewer points than ``num_reference``, or ``keep`` leaves none.
     """
-    whole, held = drawing.num_reference, bank.points.shape[1]
+    whole, held = sampling.num_reference, bank.points.shape[1]
     if held < whole:
         raise InputError(f"the shapes have {held} points each, {whole} are wanted")
     rows = round(keep * whole)
@@ -102,11 +102,11 @@ def draw_shape_pairs(
         cloud = draw_subset(subset_key, shape, jnp.asarray(whole), whole)
         if rows < whole:
             cloud = crop(crop_key, cloud, rows)
-        return jitter(noise_key, cloud, drawing)
+        return jitter(noise_key, cloud, sampling)
 
     def draw_source(key: jax.Array) -> tuple[PointCloud, RigidTransform]:
         cloud_key, pose_key = jax.random.split(key)
-        source_from_target = draw_pose(pose_key, drawing)
+        source_from_target = draw_pose(pose_key, sampling)
         moved = draw_cloud(cloud_key, rows).transform(source_from_target)
         return moved, source_from_target.inverse()
 

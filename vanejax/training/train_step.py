@@ -17,7 +17,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from vanejax.rigid import RigidTransform
-from vanejax.training.pairs import Bank, Drawing, Pair
+from vanejax.training.pairs import Bank, Pair, PairSampling
 
 Metrics = dict[str, jax.Array]
 Variables = Any
@@ -77,7 +77,7 @@ def init_state(
     model: nn.Module,
     optimizer: optax.GradientTransformation,
     bank: Bank,
-    drawing: Drawing,
+    sampling: PairSampling,
     *,
     seed: int,
 ) -> TrainState:
@@ -87,7 +87,7 @@ def init_state(
     def init(key: jax.Array) -> Variables:
         # Only the shapes of a pair matter here: inside the jit nothing of it is computed.
         draw_key = jax.random.fold_in(key, 1)
-        pairs = bank.draw(draw_key, jnp.zeros((1,), jnp.int32), drawing)
+        pairs = bank.draw(draw_key, jnp.zeros((1,), jnp.int32), sampling)
         source = jax.tree.map(lambda leaf: leaf[0], pairs.source)
         return model.init(key, source, pairs.target, RigidTransform.identity(), 1)
 
@@ -115,7 +115,7 @@ def make_train_step(
     model: nn.Module,
     optimizer: optax.GradientTransformation,
     loss: Loss,
-    drawing: Drawing,
+    sampling: PairSampling,
     *,
     batch_size: int,
     seed: int,
@@ -131,7 +131,7 @@ def make_train_step(
     def step(state: TrainState, bank: Bank) -> tuple[TrainState, Metrics]:
         order_key, draw_key = jax.random.split(jax.random.key(seed))
         views = views_of_step(order_key, state.step, batch_size=batch_size, num_views=bank.size)
-        pairs = bank.draw(jax.random.fold_in(draw_key, state.step), views, drawing)
+        pairs = bank.draw(jax.random.fold_in(draw_key, state.step), views, sampling)
         (value, metrics), gradients = jax.value_and_grad(
             lambda variables: loss(model, variables, pairs), has_aux=True
         )(state.variables)

@@ -25,7 +25,7 @@ from vanejax.matching.rpmnet import RpmNet
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera
-from vanejax.training.pairs import Drawing
+from vanejax.training.pairs import PairSampling
 
 FORMAT = "vanejax matcher"
 VERSION = 1
@@ -39,7 +39,7 @@ _MODEL = {
     "sinkhorn_iterations": (int, 1, 1000),
     "feature_width": (int, 8, 4096),
 }
-_DRAWING = {
+_SAMPLING = {
     "num_reference": (int, 16, 1 << 22),
     "num_source": (int, 16, 1 << 22),
     "noise": (float, 0.0, 10.0),
@@ -60,7 +60,7 @@ class TrainedMatcher:
       model: the network.
       variables: its weights, numpy f32; the moving average that training kept.
       iterations: of the network at inference.
-      drawing: how pairs were drawn in training: points, noise, and the poses it learned to undo.
+      sampling: how pairs were drawn in training: points, noise, and the poses it learned to undo.
         A scan of X thinned points gives ``num_reference X / Y`` source points, with Y the number
         of ``reference_points``, in ``num_source`` rows.
       voxel_mm: thinning of scan and part before points are drawn.
@@ -76,7 +76,7 @@ class TrainedMatcher:
     model: RpmNet
     variables: Mapping[str, Any]
     iterations: int
-    drawing: Drawing
+    sampling: PairSampling
     voxel_mm: float
     center: np.ndarray
     radius_mm: float
@@ -132,7 +132,7 @@ def save_model(path: str | os.PathLike[str], matcher: TrainedMatcher) -> None:
         "units": "mm and degrees; radius, noise and max_translation in radii of the part",
         "model": {name: getattr(matcher.model, name) for name in _MODEL},
         "iterations": matcher.iterations,
-        "drawing": dataclasses.asdict(matcher.drawing),
+        "drawing": dataclasses.asdict(matcher.sampling),
         "voxel_mm": matcher.voxel_mm,
         "part": {
             "name": matcher.part_name,
@@ -236,7 +236,7 @@ def _matcher(header: dict[str, Any], arrays: dict[str, np.ndarray], path: Path) 
         model=model,
         variables=_variables(model, arrays, where),
         iterations=_number(header["iterations"], int, 1, 1000, f"{where}: iterations"),
-        drawing=Drawing(**_fields(header["drawing"], _DRAWING, f"{where}, drawing")),
+        sampling=PairSampling(**_fields(header["drawing"], _SAMPLING, f"{where}, drawing")),
         voxel_mm=_number(header["voxel_mm"], float, 1e-6, 1e6, f"{where}: voxel_mm"),
         center=np.array(
             [_number(c, float, -1e9, 1e9, f"{where}, part: center_mm") for c in center]
@@ -255,10 +255,10 @@ def _matcher(header: dict[str, Any], arrays: dict[str, np.ndarray], path: Path) 
             f"{where}: reference_points {points.shape} and reference_normals {normals.shape} "
             "should both be [Y, 3]"
         )
-    if len(points) < matcher.drawing.num_reference:
+    if len(points) < matcher.sampling.num_reference:
         raise InputError(
             f"{where}: {len(points)} reference points, fewer than the "
-            f"{matcher.drawing.num_reference} that are to be drawn from them"
+            f"{matcher.sampling.num_reference} that are to be drawn from them"
         )
     return matcher
 

@@ -97,7 +97,7 @@ def check_recipe(matcher: TrainedMatcher, config: Experiment) -> None:
         "model": matcher.model,
         "iterations": matcher.iterations,
         "voxel_mm": matcher.voxel_mm,
-        "num_reference": matcher.drawing.num_reference,
+        "num_reference": matcher.sampling.num_reference,
     }
     found = [
         f"{name} is {theirs[name]}, not {value}"

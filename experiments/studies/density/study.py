@@ -38,13 +38,13 @@ from vanejax.errors import InputError
 from vanejax.matching.metrics import ffmde_abs, ffmde_signed, rmse
 from vanejax.plotting.canvas import save_figure
 from vanejax.rigid import RigidTransform
-from vanejax.training.pairs import Drawing
+from vanejax.training.pairs import PairSampling
 
 CAD_POINTS = tuple(2**power for power in range(8, 18))
 SCAN_POINTS = tuple(4**power for power in range(4, 9))
 FIXED_CAD, FIXED_SCAN = 8192, 4096  # of the cloud that is not varied
 ERRORS = ((0.0, 0.0), (0.25, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 4.0))  # deg, mm at the centre
-NOISE = Drawing().noise  # the paper's
+NOISE = PairSampling().noise  # the paper's
 METRICS = ("rmse_mm", "ffmde_abs_mm", "ffmde_signed_mm")
 
 
@@ -106,7 +106,7 @@ def jittered(
 
     ``noise`` is in unit-sphere units, ``unit_mm`` the length of one.
     """
-    clip = Drawing().noise_clip
+    clip = PairSampling().noise_clip
     return points + unit_mm * np.clip(noise * rng.standard_normal(points.shape), -clip, clip)
 
 

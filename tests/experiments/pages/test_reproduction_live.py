@@ -44,7 +44,7 @@ class FakeMatcher:
     model: Any
     iterations: int
     voxel_mm: float
-    drawing: Any
+    sampling: Any
     variables: Any = "weights"
     trained: Any = dataclasses.field(default_factory=lambda: {"commit": "abc"})
 
@@ -58,7 +58,7 @@ def matcher_of(config, **other) -> FakeMatcher:
         "model": network.model,
         "iterations": network.iterations,
         "voxel_mm": config.data.voxel_mm,
-        "drawing": dataclasses.make_dataclass("D", ["num_reference"])(config.data.num_reference),
+        "sampling": dataclasses.make_dataclass("D", ["num_reference"])(config.data.num_reference),
     }
     return FakeMatcher(**fields | other)
 

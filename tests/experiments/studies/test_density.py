@@ -32,7 +32,7 @@ from vanejax.errors import InputError
 from vanejax.matching.metrics import surface_fit
 from vanejax.pointcloud import PointCloud
 from vanejax.scanner.camera import Camera
-from vanejax.training.pairs import Drawing
+from vanejax.training.pairs import PairSampling
 
 VIEW = 52
 COUNTS = (256, 1024, 4096)
@@ -94,7 +94,7 @@ def test_rmse_on_a_plane_is_the_poisson_neighbours() -> None:
 
 
 def test_noise_is_the_papers() -> None:
-    zeros, clip = np.zeros((100_000, 3)), Drawing().noise_clip
+    zeros, clip = np.zeros((100_000, 3)), PairSampling().noise_clip
     noisy = jittered(zeros, 0.01, 70.0, np.random.default_rng(0))
     assert np.std(noisy) == pytest.approx(0.7, rel=0.01)  # 5 of its own standard deviations
     assert np.abs(jittered(zeros, 0.1, 70.0, np.random.default_rng(0))).max() == 70 * clip

@@ -17,7 +17,7 @@ from vanejax.cad.part import Part, load_part
 from vanejax.matching.contract import Registration
 from vanejax.rigid import RigidTransform
 from vanejax.training.dataset import ScanSet, make_scan_set
-from vanejax.training.pairs import Drawing, make_bank
+from vanejax.training.pairs import PairSampling, make_bank
 
 AWAY_MM = (60.0, -35.0, 20.0)  # a CAD file whose origin is not the part's centre
 
@@ -44,10 +44,10 @@ def registered(scans: ScanSet, register) -> Results:
     """Pairs without noise, of a pose up to 3 deg and 0.02 radii from the identity."""
     bank = make_bank(scans, num_reference=256)
     rows = int(bank.source_sizes.max())
-    drawing = Drawing(
+    sampling = PairSampling(
         num_reference=256, num_source=rows, noise=0.0, max_rotation_deg=3.0, max_translation=0.02
     )
-    return register_views(register, bank, drawing, seed=0, unit_mm=scans.radius_mm, progress=False)
+    return register_views(register, bank, sampling, seed=0, unit_mm=scans.radius_mm, progress=False)
 
 
 def start_as_it_is(source, target, init, key) -> Registration:
