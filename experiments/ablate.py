@@ -34,13 +34,7 @@ from experiments.runner import study_command as study
 from experiments.runner.evaluation_report import plain
 from experiments.runner.experiment import Experiment
 from experiments.runner.machine import cores, cpu_model
-from experiments.runner.run_folder import (
-    RunFolder,
-    git_commit,
-    training_record,
-    versions,
-    write_text,
-)
+from experiments.runner.run_folder import RunFolder, git_commit, training_record, versions
 from experiments.runner.sweep import Cell, Sweep, grid, parse_seeds, parse_sweeps
 from experiments.runner.trained import trained
 from experiments.studies.ablation import picture as ablation_picture
@@ -48,6 +42,7 @@ from experiments.studies.ablation.table import CELL_TESTS, over_seeds, table
 from experiments.train import Interrupted, TrainingDiverged, load_or_scan
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
+from vanejax.files import write_text
 from vanejax.plotting.canvas import save_figure
 from vanejax.training.dataset import ScanSet, describe_source
 from vanejax.training.train_step import Variables

@@ -36,6 +36,7 @@ from experiments.studies.comparison.settings import NETWORKS, Comparison
 from experiments.studies.comparison.table import table
 from experiments.train import exit_code, load_or_scan
 from vanejax.errors import InputError, MissingExtra
+from vanejax.files import write_text
 from vanejax.matching.metrics import summary
 from vanejax.training.dataset import ScanSet
 from vanejax.training.pairs import make_bank
@@ -120,7 +121,7 @@ def compare(
         )
         shown[name] = results
     report = study.save(workdir, "comparison", report)
-    (workdir / "table.md").write_text(table(report))
+    write_text(workdir / "table.md", table(report))
     if shown:
         comparison_pictures.draw(report, shown, test, workdir)
     print(table(report))

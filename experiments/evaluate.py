@@ -25,16 +25,11 @@ from experiments.runner import evaluation_pictures as pictures
 from experiments.runner.evaluation_report import hardest_views, plain, summarize, table
 from experiments.runner.experiment import Experiment
 from experiments.runner.registrations import Results, register_views
-from experiments.runner.run_folder import (
-    RunFolder,
-    git_commit,
-    training_record,
-    versions,
-    write_json,
-)
+from experiments.runner.run_folder import RunFolder, git_commit, training_record, versions
 from experiments.runner.training_record import TrainingRecord
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
+from vanejax.files import write_json
 from vanejax.training.checkpoint import Checkpoints
 from vanejax.training.dataset import ScanSet, describe_source, load_scan_set
 from vanejax.training.pairs import make_bank

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import os
 import tokenize
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from vanejax.errors import InputError
 
 
 @contextlib.contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Gives a temporary path beside ``path``, which takes that name once the block has ended.
 
     Where the block raises, ``path`` is left as it was and the temporary file is removed. A link is
@@ -45,30 +46,43 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Writes a UTF-8 text file.
+    """Writes a UTF-8 text file by `atomic_write`."""
+    with atomic_write(path) as partial:
+        partial.write_text(text, encoding="utf-8", newline="\n")
+
+
+def write_json(path: str | os.PathLike[str], value: Any, *, allow_nan: bool = True) -> None:
+    """Writes JSON by `atomic_write`; ValueError for NaN and infinity without ``allow_nan``."""
+    write_text(path, json.dumps(value, indent=2, allow_nan=allow_nan) + "\n")
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """Reads a JSON file.
 
     Raises:
-      InputError: as `whole_file`.
+      InputError: it cannot be read.
     """
-    with whole_file(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Finds out before long work whether `whole_file` will be able to write ``path``.
+    """Finds out before long work whether `atomic_write` will be able to write ``path``.
 
     An existing file is not touched.
 
     Raises:
-      InputError: as `whole_file`.
+      InputError: as `atomic_write`.
     """
-    with contextlib.suppress(_Tried), whole_file(path) as partial:
+    with contextlib.suppress(_Tried), atomic_write(path) as partial:
         partial.touch()
         raise _Tried
 
 
 class _Tried(Exception):
-    """Leaves the block of `whole_file` before it replaces anything."""
+    """Leaves the block of `atomic_write` before it replaces anything."""
 
 
 def array_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:

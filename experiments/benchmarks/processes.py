@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from experiments.benchmarks.timing import Bench, Figure
-from experiments.runner.run_folder import write_json
 from vanejax.errors import InputError
+from vanejax.files import write_json
 from vanejax.machine.pose_file import pose_to_dict
 from vanejax.scans.scan_file import save_points
 

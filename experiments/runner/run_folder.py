@@ -18,6 +18,7 @@ from experiments.runner.experiment import Experiment
 from experiments.runner.training_record import TrainingRecord
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
+from vanejax.files import read_json, write_json, write_text
 
 PACKAGES = ("vanejax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "embreex")
 CLOCK = "clock.json"
@@ -151,33 +152,6 @@ def training_record(folder: str | os.PathLike[str]) -> TrainingRecord:
 def _read_seconds(folder: Path) -> float:
     clock = folder / CLOCK
     return float(read_json(clock)["seconds"]) if clock.exists() else 0.0
-
-
-def read_json(path: Path) -> Any:
-    """A JSON file.
-
-    Raises:
-      InputError: it cannot be read.
-    """
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Writes JSON; the file appears complete or not at all."""
-    write_text(path, json.dumps(value, indent=2) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file; it appears complete or not at all."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_text(text)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def versions() -> dict[str, str | None]:

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from experiments.runner.evaluation_report import plain
-from experiments.runner.run_folder import git_commit, versions, write_json
+from experiments.runner.run_folder import git_commit, versions
 from vanejax import compilation_cache
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
+from vanejax.files import write_json
 
 
 def make_parser(name: str, description: str | None) -> argparse.ArgumentParser:

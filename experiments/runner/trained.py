@@ -9,11 +9,12 @@ from pathlib import Path
 
 from experiments.evaluate import load_variables
 from experiments.runner.experiment import Experiment
-from experiments.runner.run_folder import RunFolder, differences, read_json, training_record
+from experiments.runner.run_folder import RunFolder, differences, training_record
 from experiments.runner.training_record import TrainingRecord
 from experiments.train import fit
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
+from vanejax.files import read_json
 from vanejax.matching.torch_weights import load_state_dict, rpmnet_variables
 from vanejax.training.dataset import ScanSet
 from vanejax.training.train_step import Variables

@@ -15,6 +15,7 @@ from vanejax.cad.cad_file import MM_PER_UNIT, read_triangles
 from vanejax.cad.mesh_repair import open_surface, repair_solid
 from vanejax.cad.triangles import Triangles
 from vanejax.errors import InputError
+from vanejax.files import atomic_write
 
 # in the order in which a wrong unit is likely: "ft" comes last, few write CAD in it
 _UNIT_NAMES = {
@@ -124,14 +125,8 @@ class Part:
         scale = np.diag([1e-3, 1e-3, 1e-3, 1.0])
         scene.add_geometry(self.mesh, transform=scale if suffix == ".glb" else None)
         data = (scene if suffix == ".glb" else self.mesh).export(file_type=suffix[1:])
-        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-        try:
+        with atomic_write(path) as partial:
             partial.write_bytes(data.encode() if isinstance(data, str) else data)
-            os.replace(partial, path)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error.strerror}") from error
-        finally:
-            partial.unlink(missing_ok=True)
 
 
 def load_part(

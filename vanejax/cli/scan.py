@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -82,9 +81,9 @@ def run(arguments: argparse.Namespace) -> int:
     counts = _write_scans(arguments, folder, part, camera, viewpoints, views)
     labels = _labels(arguments, part, camera, viewpoints, views, counts)
 
-    from vanejax.files import write_text
+    from vanejax.files import write_json
 
-    write_text(folder / LABELS, json.dumps(labels, indent=2, allow_nan=False) + "\n")
+    write_json(folder / LABELS, labels, allow_nan=False)
     print(f"{folder}: {len(views)} scans of {part.name}, {sum(counts):,} points, and {LABELS}")
     return 0
 

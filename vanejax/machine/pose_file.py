@@ -18,7 +18,7 @@ from typing import Any, get_args
 import numpy as np
 
 from vanejax.errors import InputError
-from vanejax.files import write_text
+from vanejax.files import write_json
 from vanejax.localization.pose_result import (
     PointStatus,
     PoseResult,
@@ -202,7 +202,7 @@ def write_result(path: str | os.PathLike[str], result: PoseResult, **names: Any)
       InputError: the file cannot be written.
     """
     values = result_to_dict(result, **names)
-    write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
+    write_json(path, values, allow_nan=False)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from vanejax.errors import InputError
+from vanejax.files import atomic_write
 
 # The paper's green and red, in tones that differ in lightness too: a colour-blind eye is helped
 # further by the sizes that the figures give the two clouds.
@@ -52,11 +53,5 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150)
     suffix = path.suffix.lower()
     if suffix not in (".png", ".pdf", ".svg"):
         raise InputError(f"{path}: cannot draw {suffix or 'no suffix'}; use .png, .pdf or .svg")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
+    with atomic_write(path) as partial:
         figure.savefig(partial, format=suffix[1:], dpi=dpi)
-        os.replace(partial, path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        partial.unlink(missing_ok=True)

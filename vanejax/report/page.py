@@ -18,6 +18,7 @@ from scipy.special import chdtri
 
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
+from vanejax.files import write_text
 from vanejax.localization.pose_result import Alternative, PointStatus, PoseResult, Uncertainty
 from vanejax.plotting.deviation import (
     STATUS_COLORS,
@@ -138,15 +139,7 @@ def write_report(
             f"the result checks point {int(checked.max())}, but the scan {scan.name!r} has "
             f"{len(scan.points)}: it is another scan's result"
         )
-    text = _html(result, scan, part, truth)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8", newline="\n")
-        os.replace(partial, path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    write_text(path, _html(result, scan, part, truth))
 
 
 def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransform | None) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from vanejax.cad.cad_file import MM_PER_UNIT
 from vanejax.errors import InputError
-from vanejax.files import whole_file
+from vanejax.files import atomic_write
 from vanejax.scans.measured_scan import MeasuredScan, at_place, clean_scan, measured
 from vanejax.scans.point_file import read_points
 from vanejax.scans.viewpoint import sampled_rows
@@ -185,7 +185,7 @@ def save_points(
             raise InputError(
                 f"{path}: normals have shape {list(normals.shape)}, points {list(points.shape)}"
             )
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         if suffix == ".npz":
             arrays = {"points": points} | ({} if normals is None else {"normals": normals})
             with partial.open("wb") as file:  # given a name, numpy would append .npz to it

@@ -14,7 +14,7 @@ import numpy as np
 
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.files import read_stored_arrays
+from vanejax.files import atomic_write, read_stored_arrays
 from vanejax.pointcloud import voxel_thin
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, Viewpoints
@@ -88,14 +88,8 @@ class ScanSet:
             "sha256": _digest(arrays),
         }
         text = np.frombuffer(json.dumps(header, sort_keys=True).encode(), np.uint8)
-        path = Path(path)
-        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-        try:
-            with open(partial, "wb") as file:
-                np.savez(file, header=text, **arrays)
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+        with atomic_write(path) as partial, open(partial, "wb") as file:
+            np.savez(file, header=text, **arrays)
 
     def _arrays(self) -> dict[str, np.ndarray]:
         poses = self.viewpoints.camera_from_part

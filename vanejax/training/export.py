@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +10,7 @@ import jax
 import numpy as np
 
 from vanejax.errors import InputError
+from vanejax.files import read_json
 from vanejax.matching.rpmnet import RpmNet
 from vanejax.scanner.camera import Camera
 from vanejax.training.checkpoint import Checkpoints
@@ -101,7 +101,7 @@ def _evaluation(path: Path) -> dict[str, Any] | None:
     """The run's own figures on its test views; None before it was evaluated."""
     if not path.exists():
         return None
-    found = _read_json(path)
+    found = _read_object(path)
     return {name: found[name] for name in ("views", "summary", "date") if name in found}
 
 
@@ -137,7 +137,9 @@ def _read_weights(workdir: Path, model: RpmNet, checkpoint: Which) -> tuple[Any,
 
 
 def _read_run(path: Path) -> dict[str, Any]:
-    run = _read_json(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file; {path.parent} is no training run")
+    run = _read_object(path)
     part = run.get("part")
     known = isinstance(part, dict) and all(isinstance(part.get(n), str) for n in ("name", "sha256"))
     if not known or not isinstance(run.get("config"), dict):
@@ -145,11 +147,6 @@ def _read_run(path: Path) -> dict[str, Any]:
     return run
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; {path.parent} is no training run") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
-    return found if isinstance(found, dict) else {}
+def _read_object(path: Path) -> dict[str, Any]:
+    values = read_json(path)
+    return values if isinstance(values, dict) else {}

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from vanejax.cad.nearest_face import NearestFace
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.files import read_stored_arrays, whole_file
+from vanejax.files import atomic_write, read_stored_arrays
 from vanejax.matching.rpmnet import RpmNet
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
@@ -147,7 +147,7 @@ def save_model(path: str | os.PathLike[str], matcher: TrainedMatcher) -> None:
     arrays = weights_by_name(matcher.variables)
     arrays |= {name: np.asarray(getattr(matcher, name)) for name in _REFERENCE}
     _matcher(json.loads(text), arrays, path)
-    with whole_file(path) as partial, open(partial, "wb") as file:
+    with atomic_write(path) as partial, open(partial, "wb") as file:
         np.savez(file, header=np.frombuffer(text, np.uint8), **arrays)
 
 

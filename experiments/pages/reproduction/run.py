@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from experiments.pages.reproduction.studies import INPUTS, Outcome, Study
-from experiments.runner.run_folder import git_commit, read_json, write_json
+from experiments.runner.run_folder import git_commit
 from vanejax.errors import InputError
+from vanejax.files import read_json, write_json
 
 _EXCERPT = 300  # characters of a log's last line
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.runner.run_folder import read_json
 from vanejax.errors import InputError
+from vanejax.files import read_json
 
 ROOT = Path(__file__).parents[3]
 RESULTS = ROOT / "experiments" / "results"

@@ -30,12 +30,13 @@ from experiments.runner.evaluation_report import hardest_views
 from experiments.runner.experiment import Experiment
 from experiments.runner.machine import cores, cpu_model
 from experiments.runner.registrations import Results
-from experiments.runner.run_folder import git_commit, read_json, versions
+from experiments.runner.run_folder import git_commit, versions
 from experiments.runner.trained import given_runs, trained
 from experiments.studies.comparison.table import training_line
 from experiments.train import exit_code, load_or_scan
 from vanejax import plotting
 from vanejax.errors import InputError
+from vanejax.files import read_json
 from vanejax.matching.metrics import mean_per_axis, mean_per_view
 from vanejax.training.dataset import ScanSet
 

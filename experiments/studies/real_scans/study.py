@@ -25,10 +25,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from experiments.runner import study_command as study
-from experiments.runner.run_folder import read_json
 from vanejax.cad.cad_file import MM_PER_UNIT
 from vanejax.cad.part import Part, load_part
 from vanejax.errors import InputError
+from vanejax.files import read_json
 from vanejax.localization.registration import register
 from vanejax.machine.pose_file import rigid_from_matrix
 from vanejax.rigid import RigidTransform

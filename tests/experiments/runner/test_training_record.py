@@ -6,9 +6,10 @@ import math
 
 import pytest
 
-from experiments.runner.run_folder import RunFolder, training_record, write_text
+from experiments.runner.run_folder import RunFolder, training_record
 from experiments.runner.training_record import VALIDATION, TrainingRecord
 from vanejax.errors import InputError
+from vanejax.files import write_text
 
 
 def rows(errors_deg: list[float]) -> list[dict[str, float]]:

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from vanejax.errors import InputError
-from vanejax.files import check_writable, whole_file, write_text
+from vanejax.files import atomic_write, check_writable, write_text
 
 
 def write_half(path: Path, error: BaseException) -> None:
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text("half")
         raise error
 
