@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from experiments.runner import study_command as study
 from vanejax import plotting
-from vanejax.cad.investment_casting import Casting, as_cast
+from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cad.parametric_vane import guide_vane
 from vanejax.cad.part import Part
 from vanejax.localization.pose_result import PoseResult
@@ -121,7 +121,7 @@ def main(settings: argparse.Namespace) -> None:
     sphere = hemisphere_viewpoints(part.center)
     printed = hemisphere_viewpoints(part.center, formula="printed")
     result, scan = registered(scanner, sphere, settings.seed)
-    cast = as_cast(part, Casting(allowance_mm=0.5), np.random.default_rng(settings.seed))
+    cast = as_cast(part, InvestmentCasting(allowance_mm=0.5), np.random.default_rng(settings.seed))
     figures = {
         "how_viewpoints": viewpoints_picture(sphere, printed, part.center),
         "how_shadow": shadow_picture(scanner, sphere),

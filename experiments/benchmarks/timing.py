@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from experiments.runner import study_command as study
-from experiments.runner.vane_views import VaneViews, beside, magnitudes, pose_error, with_noise
+from experiments.runner.vane_views import VaneViews, magnitudes, perturb, pose_error, with_noise
 from vanejax.rigid import RigidTransform
 from vanejax.scans.measured_scan import MeasuredScan
 from vanejax.training.pretrained import find_weights
@@ -87,7 +87,7 @@ class Bench:
         """part_from_camera beside the true one."""
         rng = np.random.default_rng([self.seed, 1])
         truth = self.views.truth(self.view)
-        return beside(truth, self.views.part, deg=START_DEG, mm=START_MM, rng=rng)
+        return perturb(truth, self.views.part, deg=START_DEG, mm=START_MM, rng=rng)
 
     @functools.cached_property
     def matcher(self) -> TrainedMatcher | None:

@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 
-from vanejax.cad.investment_casting import Casting, as_cast
+from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.scanner.sensor import Sensor, preset
@@ -91,9 +91,9 @@ class EndlessSettings:
         ]
 
 
-def random_casting(rng: np.random.Generator, most_mm: float) -> Casting:
+def random_casting(rng: np.random.Generator, most_mm: float) -> InvestmentCasting:
     """Stock of up to ``most_mm``; waves (one deviation) and a bow of up to a fifth of it."""
-    return Casting(
+    return InvestmentCasting(
         allowance_mm=rng.uniform(0, most_mm),
         waviness_mm=rng.uniform(0, most_mm / 5),
         wavelength_mm=rng.uniform(20, 60),

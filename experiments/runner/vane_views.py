@@ -76,7 +76,7 @@ def with_noise(points: np.ndarray, noise_mm: float, rng: np.random.Generator) ->
     return points * (1 + noise_mm * rng.standard_normal(len(points)) / range_mm)[:, None]
 
 
-def beside(
+def perturb(
     pose: RigidTransform, part: Part, *, deg: float, mm: float, rng: np.random.Generator
 ) -> RigidTransform:
     """part_from_camera turned by exactly ``deg`` and moved by ``mm`` at the part's centre.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from vanejax.cad.investment_casting import CUT, Casting, as_cast, waviness
+from vanejax.cad.investment_casting import CUT, InvestmentCasting, as_cast, waviness
 from vanejax.cad.parametric_vane import guide_vane
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
@@ -16,9 +16,9 @@ from vanejax.plotting.casting import casting_map
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
 from vanejax.scanner.virtual_scanner import Scanner
 
-NOTHING = Casting(allowance_mm=0, waviness_mm=0)
+NOTHING = InvestmentCasting(allowance_mm=0, waviness_mm=0)
 STOCK = dataclasses.replace(NOTHING, allowance_mm=0.5)
-WAVES = Casting(allowance_mm=0, waviness_mm=0.2, wavelength_mm=40)
+WAVES = InvestmentCasting(allowance_mm=0, waviness_mm=0.2, wavelength_mm=40)
 CAMERA = Camera().scaled(0.15)
 
 
@@ -73,7 +73,7 @@ def test_stock_moves_the_faces_of_a_box(stock_mm):
 
 def test_stock_does_not_fold_a_concave_corner():
     """With waviness of nearly nothing, so that vertices stand within the stock of the corner."""
-    casting = Casting(allowance_mm=1.0, waviness_mm=1e-6, wavelength_mm=2.5)
+    casting = InvestmentCasting(allowance_mm=1.0, waviness_mm=1e-6, wavelength_mm=2.5)
     cast = as_cast(bracket(), casting, rng())
     # as the L with each wall moved by 1 mm: 32 x 32 less 25 x 25, 22 high
     assert cast.mesh.volume == pytest.approx((32 * 32 - 25 * 25) * 22, rel=1e-3)
@@ -83,7 +83,7 @@ def test_stock_does_not_fold_a_concave_corner():
 
 
 def test_the_vanes_casting_is_closed_and_within_its_limits(vane):
-    casting = Casting()
+    casting = InvestmentCasting()
     assert casting.limits_mm == pytest.approx((0.05, 0.95))
     cast = as_cast(vane, casting, rng())
     assert cast.closed
@@ -103,10 +103,10 @@ def test_the_vanes_casting_is_closed_and_within_its_limits(vane):
 
 
 def test_equal_generators_give_equal_bits():
-    one, two, other = (as_cast(box(), Casting(), rng(seed)) for seed in (0, 0, 1))
+    one, two, other = (as_cast(box(), InvestmentCasting(), rng(seed)) for seed in (0, 0, 1))
     assert one.sha256 == two.sha256 != other.sha256
     draws = rng()
-    first, second = (as_cast(box(), Casting(), draws) for _ in range(2))
+    first, second = (as_cast(box(), InvestmentCasting(), draws) for _ in range(2))
     assert first.sha256 == one.sha256 != second.sha256
 
 
@@ -210,15 +210,15 @@ def test_the_map_shows_the_offset(vane):
 )
 def test_settings_that_no_casting_can_have(wrong, message):
     with pytest.raises(InputError, match=message):
-        Casting(**wrong)
+        InvestmentCasting(**wrong)
 
 
 def test_a_wavelength_too_short_for_the_part_and_an_open_surface():
     with pytest.raises(InputError, match="60 mm needs too many faces"):
-        as_cast(box(), Casting(wavelength_mm=0.5), rng())
+        as_cast(box(), InvestmentCasting(wavelength_mm=0.5), rng())
     solid = box()
     sheet = part_from_mesh(
         solid.mesh.vertices, solid.mesh.faces[:-2], name="sheet", must_be_closed=False
     )
     with pytest.raises(InputError, match="open surface"):
-        as_cast(sheet, Casting(), rng())
+        as_cast(sheet, InvestmentCasting(), rng())

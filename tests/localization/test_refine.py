@@ -21,7 +21,7 @@ from example_scans import (
 )
 from scipy.stats import chi2
 
-from vanejax.cad.investment_casting import Casting, as_cast
+from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.localization.covariance import uncertainty
@@ -339,7 +339,7 @@ def test_errors_that_go_together_widen_the_covariance(fine):
 @pytest.fixture(scope="module")
 def cast() -> tuple[np.ndarray, RigidTransform]:
     """14,000 points on the vane with 0.5 mm of stock, 0.05 mm of noise; the CAD model's pose."""
-    stock = Casting(allowance_mm=0.5, waviness_mm=0)
+    stock = InvestmentCasting(allowance_mm=0.5, waviness_mm=0)
     part = as_cast(vane(), stock, np.random.default_rng(0))
     scan, truth = ideal_scan(part, camera=MIDDLE)
     return with_noise(exact_points(part, scan), 0.05, 0), truth

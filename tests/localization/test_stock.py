@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from example_scans import pose_error, vane, with_noise
 
-from vanejax.cad.investment_casting import Casting, as_cast
+from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cli.program import main
 from vanejax.errors import InputError
 from vanejax.localization.pose_result import PoseResult
@@ -26,7 +26,7 @@ STOCK_MM = 0.5
 @functools.cache
 def stocked() -> tuple[np.ndarray, RigidTransform]:
     """Points of a casting with 0.5 mm of stock and 0.1 mm of noise, and part_from_camera."""
-    casting = Casting(allowance_mm=STOCK_MM, waviness_mm=0.0)
+    casting = InvestmentCasting(allowance_mm=STOCK_MM, waviness_mm=0.0)
     cast = as_cast(vane(), casting, np.random.default_rng(0))
     pose = hemisphere_viewpoints(vane().center).view(45)
     scan = Scanner(cast).scan(Camera(width=320, height=256), pose)

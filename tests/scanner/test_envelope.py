@@ -9,7 +9,7 @@ import trimesh
 
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, look_at
-from vanejax.scanner.image_window import SIDES, Envelope, Window
+from vanejax.scanner.image_window import SIDES, PartEnvelope, Window
 
 POSE = look_at(400 * np.array([0.43301, 0.25, 0.86603]), np.zeros(3))
 
@@ -30,7 +30,7 @@ def plate() -> np.ndarray:
     ids=["knot", "far away", "tiny", "plate", "triangle", "needle"],
 )
 def test_it_holds_every_vertex_with_a_margin(vertices):
-    envelope = Envelope.around(vertices)
+    envelope = PartEnvelope.around(vertices)
     outward = scipy.spatial.ConvexHull(envelope.corners).equations
     beyond = vertices @ outward[:, :3].T + outward[:, 3]
     radius = np.linalg.norm(vertices - vertices.mean(axis=0), axis=-1).max()
@@ -43,16 +43,16 @@ def test_it_holds_every_vertex_with_a_margin(vertices):
 def test_its_size_is_bounded_whatever_the_mesh():
     fine = trimesh.creation.icosphere(6, 50.0).vertices
     assert len(fine) > 40_000
-    envelope = Envelope.around(fine)
+    envelope = PartEnvelope.around(fine)
     assert len(envelope.corners) <= 2 * SIDES - 4  # Euler: of a polytope of simple corners
     assert len(envelope.edges) <= 3 * len(envelope.corners) - 6
     assert np.linalg.norm(envelope.corners, axis=-1).max() < 1.05 * 50  # 1 / cos 12 deg + 1e-3
 
 
 def test_chunks_of_vertices_do_not_change_it(monkeypatch):
-    whole = Envelope.around(knot())
+    whole = PartEnvelope.around(knot())
     monkeypatch.setattr("vanejax.scanner.image_window.VERTICES_AT_ONCE", 7)
-    np.testing.assert_allclose(Envelope.around(knot()).corners, whole.corners, atol=1e-9)
+    np.testing.assert_allclose(PartEnvelope.around(knot()).corners, whole.corners, atol=1e-9)
 
 
 def covered(windows: list[Window], camera: Camera) -> np.ndarray:
@@ -85,7 +85,7 @@ CAMERAS = {
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_windows_hold_every_pixel_of_the_hull_once(camera, pixels):
     for vertices in (knot(), plate()):
-        windows = Envelope.around(vertices).windows(camera, POSE, pixels=pixels)
+        windows = PartEnvelope.around(vertices).windows(camera, POSE, pixels=pixels)
         count = covered(windows, camera)
         wanted = hull_pixels(vertices, camera, POSE)
         assert (count[wanted] == 1).all()
@@ -99,7 +99,7 @@ def test_windows_are_not_much_larger_than_the_hull():
     camera = Camera()
     vertices = knot()
     wanted = hull_pixels(vertices, camera, POSE).sum()
-    envelope = Envelope.around(vertices)
+    envelope = PartEnvelope.around(vertices)
     # 6 % are the envelope's, the rest are corners of the windows
     by_row, by_strip, whole = (
         sum(w.size for w in envelope.windows(camera, POSE, pixels=pixels))
@@ -112,7 +112,7 @@ def test_windows_are_not_much_larger_than_the_hull():
 
 def test_behind_and_beside_the_camera():
     camera = Camera(width=128, height=102)
-    envelope = Envelope.around(knot())
+    envelope = PartEnvelope.around(knot())
     beside = look_at(np.array([0.0, 0.0, 400.0]), np.array([500.0, 0.0, 0.0]))
     assert envelope.windows(camera, beside, pixels=1000) == []
     among = look_at(np.array([0.0, 0.0, 1.0]), np.zeros(3))

@@ -11,7 +11,7 @@ from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints, look_at
-from vanejax.scanner.image_window import Envelope, Window
+from vanejax.scanner.image_window import PartEnvelope, Window
 from vanejax.scanner.virtual_scanner import Scan, Scanner, scan_views
 
 ORIGIN = np.zeros(3)
@@ -237,7 +237,7 @@ def test_casting_every_pixel_finds_no_more(ring, monkeypatch, camera, pose):
     everywhere = [
         Window(slice(row, row + 1), slice(0, camera.width)) for row in range(camera.height)
     ]
-    monkeypatch.setattr(Envelope, "windows", lambda *_, **__: everywhere)
+    monkeypatch.setattr(PartEnvelope, "windows", lambda *_, **__: everywhere)
     whole = scanner.scan(camera, pose)
     assert len(scan.pixel) > 200
     for name in ("pixel", "face", "points", "normals"):

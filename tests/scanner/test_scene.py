@@ -14,8 +14,8 @@ from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import hemisphere_viewpoints
 from vanejax.scanner.clutter import (
     Clutter,
-    Extra,
-    Scene,
+    ClutterObject,
+    ClutterScene,
     chips,
     clamps,
     clutter_scene,
@@ -33,17 +33,17 @@ def above(part: Part) -> RigidTransform:
 
 
 @pytest.fixture(scope="module")
-def full() -> Scene:
+def full() -> ClutterScene:
     return clutter_scene(vane(), FULL, np.random.default_rng([0, 1]))
 
 
-def of_kind(scene: Scene, kind: str) -> list[trimesh.Trimesh]:
-    return [extra.mesh for extra in scene.extras if extra.kind == kind]
+def of_kind(scene: ClutterScene, kind: str) -> list[trimesh.Trimesh]:
+    return [item.mesh for item in scene.objects if item.kind == kind]
 
 
 def test_no_clutter_is_the_bare_part_bit_for_bit():
     scene = clutter_scene(vane(), Clutter(), np.random.default_rng(0))
-    assert scene.extras == ()
+    assert scene.objects == ()
     seen = scene.scanner().scan(SMALL, above(vane()))
     bare = Scanner(vane()).scan(SMALL, above(vane()))
     for name in ("points", "normals", "face", "pixel"):
@@ -72,14 +72,14 @@ def test_what_is_seen_of_the_part_is_what_was_seen_without_the_rest(full):
 
 def test_owners_are_the_extras_in_their_order(full):
     part = len(vane().mesh.faces)
-    counts = [len(extra.mesh.faces) for extra in full.extras]
+    counts = [len(item.mesh.faces) for item in full.objects]
     expected = np.repeat(np.arange(len(counts) + 1), [part, *counts])
     owner = full.owner(np.arange(len(expected)))
     np.testing.assert_array_equal(owner, expected)
     assert owner.dtype == np.int32
     corners = full.surface.mesh.triangles
     np.testing.assert_allclose(
-        corners[owner == 2], full.extras[1].mesh.triangles, atol=ROUNDING_MM, rtol=0
+        corners[owner == 2], full.objects[1].mesh.triangles, atol=ROUNDING_MM, rtol=0
     )
 
 
@@ -91,12 +91,12 @@ def test_a_seed_is_a_scene(full):
 
 
 def test_everything_is_a_closed_solid_with_its_outside_outside(full):
-    kinds = [extra.kind for extra in full.extras]
+    kinds = [item.kind for item in full.objects]
     assert [kinds.count(k) for k in ("table", "clamp", "chip", "drop")] == [1, 2, 25, 20]
-    for extra in full.extras:
-        assert extra.mesh.is_watertight
-        assert extra.mesh.is_winding_consistent
-        assert extra.mesh.volume > 0
+    for item in full.objects:
+        assert item.mesh.is_watertight
+        assert item.mesh.is_winding_consistent
+        assert item.mesh.volume > 0
 
 
 @pytest.mark.parametrize("tilt", [0.0, 8.0])
@@ -131,7 +131,7 @@ def test_chips_lie_on_something_and_in_nothing():
     box = trimesh.creation.box(bounds=[[-40, -30, 0], [40, 30, 20]])
     part = part_from_mesh(box.vertices, box.faces, name="box")
     plate = table(part)
-    below = Scene(part, (plate,)).scanner()
+    below = ClutterScene(part, (plate,)).scanner()
     found = chips(below, part, np.random.default_rng(3), 40)
     assert len(found) == 40
     heights = set()
@@ -167,9 +167,9 @@ def test_drops_sit_on_a_sphere_along_its_normal():
 def test_nothing_lies_where_there_is_nothing_to_lie_on():
     box = trimesh.creation.box((40.0, 30.0, 20.0))
     part = part_from_mesh(box.vertices, box.faces, name="box")
-    for extra in clutter_scene(part, Clutter(chips=20, drops=20), np.random.default_rng(0)).extras:
-        assert np.isfinite(extra.mesh.vertices).all()
-        lowest = extra.mesh.vertices[np.argmin(extra.mesh.vertices[:, 2])]
+    for item in clutter_scene(part, Clutter(chips=20, drops=20), np.random.default_rng(0)).objects:
+        assert np.isfinite(item.mesh.vertices).all()
+        lowest = item.mesh.vertices[np.argmin(item.mesh.vertices[:, 2])]
         assert np.max(np.abs(lowest[:2]) - [20, 15]) < 15
         assert lowest[2] > 10 - 1.6  # a skirt's depth
 
@@ -177,10 +177,10 @@ def test_nothing_lies_where_there_is_nothing_to_lie_on():
 def test_an_open_part_gives_an_open_scene():
     sheet = trimesh.creation.box((60.0, 40.0, 10.0))
     part = part_from_mesh(sheet.vertices, sheet.faces[2:], name="sheet", must_be_closed=False)
-    scene = Scene(part, (table(part),))
+    scene = ClutterScene(part, (table(part),))
     assert not scene.surface.closed
-    assert Scene(bracket(), (table(bracket()),)).surface.closed
-    assert isinstance(scene.extras[0], Extra)
+    assert ClutterScene(bracket(), (table(bracket()),)).surface.closed
+    assert isinstance(scene.objects[0], ClutterObject)
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def test_faces_that_the_projector_sees_from_behind_are_dark():
 def test_dropout_begins_at_its_angle():
     part = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
     scanner = Scanner(part_from_mesh(part.vertices, part.faces, name="ball"))
-    scan = take(scanner, Sensor(camera=CAMERA, most_incidence_deg=60.0))
+    scan = take(scanner, Sensor(camera=CAMERA, max_incidence_deg=60.0))
     steep = scan.ideal.incidence_deg > 60.0
     clear = np.abs(scan.ideal.incidence_deg - 60.0) > 1e-3
     assert steep.sum() > 1000
@@ -207,14 +207,16 @@ def test_correlated_noise_is_smooth_white_noise_is_not(plate):
 
 
 def test_errors_lie_along_the_pixel_s_ray(plate):
-    scan = take(plate, Sensor(camera=CAMERA, noise_px=0.2, mixed_share=1.0, outlier_share=0.01))
+    scan = take(
+        plate, Sensor(camera=CAMERA, noise_px=0.2, flying_pixel_rate=1.0, outlier_rate=0.01)
+    )
     true = scan.ideal.points[scan.kept]
     np.testing.assert_allclose(np.cross(true, scan.points) / 400**2, 0, atol=3e-7)  # f32 eps, twice
 
 
 def test_mixed_pixels_lie_at_depth_edges_between_both_surfaces():
     scanner = Scanner(solid(((-90, -60, -4), (90, 60, 0)), ((-20, -20, -1), (20, 20, 30))))
-    scan = take(scanner, Sensor(camera=CAMERA, mixed_share=1.0, jump_mm=5.0))
+    scan = take(scanner, Sensor(camera=CAMERA, flying_pixel_rate=1.0, jump_mm=5.0))
     error = depth_error(scan)
     moved = np.abs(error) > 1e-3
     assert 100 < moved.sum() < 0.05 * len(error)
@@ -230,10 +232,10 @@ def test_mixed_pixels_lie_at_depth_edges_between_both_surfaces():
 
 
 def test_steps_of_depth_and_of_disparity(plate):
-    scan = take(plate, Sensor(camera=CAMERA, noise_px=0.3, step_mm=0.5))
+    scan = take(plate, Sensor(camera=CAMERA, noise_px=0.3, depth_quantisation_mm=0.5))
     steps = -scan.points[:, 2] / 0.5
     np.testing.assert_allclose(steps, np.round(steps), atol=2e-4)
-    sensor = Sensor(camera=CAMERA, noise_px=0.3, step_px=0.125)
+    sensor = Sensor(camera=CAMERA, noise_px=0.3, disparity_quantisation_px=0.125)
     disparity = sensor.focal_baseline / -take(plate, sensor).points[:, 2].astype(np.float64) / 0.125
     np.testing.assert_allclose(disparity, np.round(disparity), atol=1e-3)
     assert len(np.unique(np.round(disparity))) > 5
@@ -255,7 +257,7 @@ def test_trueness_biases_and_does_not_scatter(plate):
 
 
 def test_outliers_and_lost_pixels_have_their_shares(plate):
-    scan = take(plate, Sensor(camera=CAMERA, outlier_share=0.05, outlier_mm=10.0, lost_share=0.1))
+    scan = take(plate, Sensor(camera=CAMERA, outlier_rate=0.05, outlier_mm=10.0, dropout_rate=0.1))
     error = np.abs(depth_error(scan))
     count = len(scan.reason)
     # binomial: 4 standard deviations
@@ -267,7 +269,7 @@ def test_outliers_and_lost_pixels_have_their_shares(plate):
 
 def test_what_is_measured_outside_the_clip_planes_is_dropped(plate):
     near = dataclasses.replace(CAMERA, near_mm=399.0)
-    scan = take(plate, Sensor(camera=near, outlier_share=0.5, outlier_mm=50.0))
+    scan = take(plate, Sensor(camera=near, outlier_rate=0.5, outlier_mm=50.0))
     assert np.mean(scan.reason == Reason.OUT_OF_RANGE) > 0.15
     assert (-scan.points[:, 2] >= 399.0).all()
 
@@ -297,11 +299,13 @@ def test_the_paper_s_camera_keeps_the_accuracy_of_its_table():
         half = z / 8
         scanner = Scanner(solid(((-half, -half, -4), (half, half, 0))))
         pose = look_at(np.array([0.0, 0.0, z]), np.zeros(3))
-        sensor = dataclasses.replace(preset("paper_camera"), mixed_share=0.0, outlier_share=0.0)
+        sensor = dataclasses.replace(
+            preset("paper_camera"), flying_pixel_rate=0.0, outlier_rate=0.0
+        )
         errors = []
         for seed in range(8):
             rng = np.random.default_rng(seed)
-            scan = measure(scanner, sensor.another(rng).exposed_for(z), pose, rng)
+            scan = measure(scanner, sensor.sample(rng).exposed_for(z), pose, rng)
             assert len(scan.points), f"nothing is measured at {z} mm"
             errors.append(np.quantile(np.abs(depth_error(scan)), 0.95))
         assert 0.3 * bound < np.median(errors) <= bound
@@ -310,13 +314,13 @@ def test_the_paper_s_camera_keeps_the_accuracy_of_its_table():
 def test_another_camera_of_a_kind_differs_and_keeps_its_switches():
     rng = np.random.default_rng(0)
     kind = preset("paper_camera")
-    made = [kind.another(rng) for _ in range(200)]
+    made = [kind.sample(rng) for _ in range(200)]
     scales = np.array([sensor.trueness.scale for sensor in made])
     np.testing.assert_allclose(scales.std(), kind.trueness.scale, rtol=0.2)
     noise = np.log([sensor.noise_px / kind.noise_px for sensor in made])
     np.testing.assert_allclose(noise.std(), 0.3, rtol=0.2)
     assert all(sensor.shadow and sensor.camera == kind.camera for sensor in made)
-    assert dataclasses.replace(Sensor().another(rng), correlation_px=16.0) == Sensor()
+    assert dataclasses.replace(Sensor().sample(rng), correlation_px=16.0) == Sensor()
 
 
 def test_exposure_follows_the_distance():
@@ -335,7 +339,7 @@ def test_fewer_pixels_leave_the_errors_in_mm(plate):
         assert small.camera.width == sensor.camera.width * factor
         assert small.range_sigma_mm(400.0) == pytest.approx(sensor.range_sigma_mm(400.0))
         # in mm an error of the disparity is z^2 / (f b) of it, and a length in the image z / f
-        for name in ("correlated_px", "correlation_px", "step_px"):
+        for name in ("correlated_px", "correlation_px", "disparity_quantisation_px"):
             mine, theirs = (getattr(s, name) / s.camera.fx for s in (small, sensor))
             assert mine == pytest.approx(theirs), name
 
@@ -344,16 +348,16 @@ def test_fewer_pixels_leave_the_errors_in_mm(plate):
     ("name", "value"),
     [
         ("baseline_mm", 0.0),
-        ("most_incidence_deg", 91.0),
+        ("max_incidence_deg", 91.0),
         ("noise_px", -1.0),
         ("window_px", -1.0),
-        ("adhesion_px", float("nan")),
-        ("rim_px", -0.5),
+        ("edge_fattening_px", float("nan")),
+        ("border_dropout_px", -0.5),
         ("incidence_spread_deg", -1.0),
         ("correlation_px", 0.5),
-        ("mixed_share", 1.5),
-        ("outlier_share", float("nan")),
-        ("step_mm", float("inf")),
+        ("flying_pixel_rate", 1.5),
+        ("outlier_rate", float("nan")),
+        ("depth_quantisation_mm", float("inf")),
     ],
 )
 def test_a_sensor_that_cannot_be_is_refused(name, value):
@@ -397,7 +401,7 @@ def test_a_matching_window_rounds_a_ridge_off():
 
 def test_what_a_window_matched_beside_its_pixel_errs_by_the_slope():
     slope, adhesion = 0.8, 0.5
-    sensor = Sensor(camera=CAMERA, adhesion_px=adhesion, correlation_px=4.0, jump_mm=20.0)
+    sensor = Sensor(camera=CAMERA, edge_fattening_px=adhesion, correlation_px=4.0, jump_mm=20.0)
     errors = []
     for seed in range(4):
         scan = take(roof(slope), sensor, seed=seed)
@@ -410,7 +414,7 @@ def test_what_a_window_matched_beside_its_pixel_errs_by_the_slope():
 
 
 def test_a_flat_plate_is_the_same_for_any_window(plate):
-    flat = take(plate, Sensor(camera=CAMERA, window_px=2.0, adhesion_px=2.0))
+    flat = take(plate, Sensor(camera=CAMERA, window_px=2.0, edge_fattening_px=2.0))
     np.testing.assert_allclose(depth_error(flat), 0, atol=1e-3)  # f32 eps times 400, and a sum
 
 
@@ -449,7 +453,7 @@ def test_a_rim_is_what_lies_near_a_pixel_that_sees_nothing():
 
 
 def test_the_outline_is_lost_and_nothing_else(plate):
-    sensor = Sensor(camera=CAMERA, rim_px=2.0, correlation_px=4.0)
+    sensor = Sensor(camera=CAMERA, border_dropout_px=2.0, correlation_px=4.0)
     scans = [take(plate, sensor, seed=seed) for seed in range(4)]
     lost = np.stack([scan.reason == Reason.LOST for scan in scans])
     x, y = np.abs(ABOVE.inverse().apply(scans[0].ideal.points.astype(np.float64))[:, :2]).T
@@ -464,7 +468,7 @@ def test_the_limit_of_incidence_varies_from_place_to_place():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
     scanner = Scanner(part_from_mesh(ball.vertices, ball.faces, name="ball"))
     sensor = Sensor(
-        camera=CAMERA, most_incidence_deg=60.0, incidence_spread_deg=5.0, correlation_px=3.0
+        camera=CAMERA, max_incidence_deg=60.0, incidence_spread_deg=5.0, correlation_px=3.0
     )
     scans = [take(scanner, sensor, seed=seed) for seed in range(3)]
     incidence = np.concatenate([scan.ideal.incidence_deg for scan in scans])

@@ -10,18 +10,18 @@ from example_scans import bracket, measured_points, random_view, vane, with_nois
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.clutter import Clutter, Extra, Scene, clutter_scene, table
+from vanejax.scanner.clutter import Clutter, ClutterObject, ClutterScene, clutter_scene, table
 from vanejax.scans.segmentation import Segment, is_larger, largest_slab_mm2, segment
 
 CAMERA = Camera(width=400, height=320, near_mm=200.0)
 ORIGIN = np.zeros(3)
 
 
-def seen(scene: Scene, view: int = 103, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def seen(scene: ClutterScene, view: int = 103, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Points [N, 3] mm with 0.1 mm of noise, and what they are [N]: "part", "table", ..."""
     pose = hemisphere_viewpoints(scene.part.center).view(view)
     scan = scene.scanner().scan(CAMERA, pose)
-    kinds = np.array(["part", *(extra.kind for extra in scene.extras)])
+    kinds = np.array(["part", *(item.kind for item in scene.objects)])
     points = with_noise(scan.points.astype(np.float64), 0.1, seed)
     return points, kinds[scene.owner(scan.face)]
 
@@ -65,7 +65,7 @@ def test_nothing_is_taken_from_a_part_alone(name, origin):
 
 def test_a_plate_on_a_table_is_not_the_table():
     part = plate()
-    points, kind = seen(Scene(part, (table(part),)))
+    points, kind = seen(ClutterScene(part, (table(part),)))
     found = segment(points, part, sensor_origin=ORIGIN)
     assert share(found.label[kind == "table"], Segment.TABLE) > 0.99
     assert share(found.label[kind == "part"], Segment.PART) > 0.98
@@ -73,11 +73,11 @@ def test_a_plate_on_a_table_is_not_the_table():
 
 
 def test_the_plane_found_is_the_tables():
-    scene = Scene(vane(), (table(vane(), tilt_deg=4.0, azimuth_deg=70.0),))
+    scene = ClutterScene(vane(), (table(vane(), tilt_deg=4.0, azimuth_deg=70.0),))
     pose = hemisphere_viewpoints(vane().center).view(103)
     points, kind = seen(scene)
     (plane,) = segment(points, vane(), sensor_origin=ORIGIN).tables
-    corners = pose.apply(np.asarray(scene.extras[0].mesh.vertices))
+    corners = pose.apply(np.asarray(scene.objects[0].mesh.vertices))
     top = np.sort(plane.height_mm(corners))[4:]
     np.testing.assert_allclose(top, 0, atol=0.05)  # 40,000 points of 0.1 mm; 420 mm from the middle
     assert plane.height_mm(points[kind == "part"]).min() > -0.5
@@ -86,7 +86,7 @@ def test_the_plane_found_is_the_tables():
 
 def test_a_wall_behind_which_the_part_stands_is_no_table():
     """The sensor is on the other side: it cannot have seen the part through it."""
-    points, _ = seen(Scene(vane(), (table(vane()),)))
+    points, _ = seen(ClutterScene(vane(), (table(vane()),)))
     (plane,) = segment(points, vane(), sensor_origin=ORIGIN).tables
     below = -200.0 * plane.normal + points.mean(axis=0)
     assert segment(points, vane(), sensor_origin=below).tables == ()
@@ -115,7 +115,7 @@ def test_a_block_larger_than_the_part_is_not_the_part():
     part = bracket()
     low = part.mesh.bounds[0] - [110, 0, 0]
     block = trimesh.creation.box(bounds=[low, np.add(low, [95, 90, 45])])
-    scene = Scene(part, (Extra("clamp", block),))
+    scene = ClutterScene(part, (ClutterObject("clamp", block),))
     points, kind = seen(scene, view=3)
     assert np.sum(kind == "clamp") > 1.3 * np.sum(kind == "part")
     found = segment(points, part, sensor_origin=ORIGIN)

@@ -5,7 +5,7 @@ closed solid in millimetres in a fixed order of faces, with samples of its surfa
 and castings of it that differ from the model as investment castings do.
 """
 
-from vanejax.cad.investment_casting import Casting, as_cast
+from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cad.nearest_face import NearestFace
 from vanejax.cad.parametric_vane import GuideVaneSegment, guide_vane
 from vanejax.cad.part import Part, load_part, part_from_mesh
@@ -13,8 +13,8 @@ from vanejax.cad.surface import Surface
 from vanejax.cad.triangles import Triangles
 
 __all__ = [
-    "Casting",
     "GuideVaneSegment",
+    "InvestmentCasting",
     "NearestFace",
     "Part",
     "Surface",

@@ -34,7 +34,7 @@ SLACK_MM, REACH_MM = 0.03, 10.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Casting:
+class InvestmentCasting:
     """How a casting differs from its CAD model; the defaults are an investment casting's.
 
     The offset along the outward normal is ``allowance_mm + w``, with w a Gaussian random field of
@@ -80,7 +80,7 @@ class Casting:
         return self.allowance_mm - swing, self.allowance_mm + swing
 
 
-def as_cast(part: Part, casting: Casting, rng: np.random.Generator) -> Part:
+def as_cast(part: Part, casting: InvestmentCasting, rng: np.random.Generator) -> Part:
     """One casting of a part, in the CAD model's frame.
 
     Args:
@@ -107,7 +107,9 @@ def as_cast(part: Part, casting: Casting, rng: np.random.Generator) -> Part:
     return part_from_mesh(cast, faces, name=f"{part.name} as cast")
 
 
-def waviness(points: np.ndarray, casting: Casting, rng: np.random.Generator) -> np.ndarray:
+def waviness(
+    points: np.ndarray, casting: InvestmentCasting, rng: np.random.Generator
+) -> np.ndarray:
     """The random field w [N] f64, mm, at points [N, 3] in mm, cut off at `CUT` deviations.
 
     Random Fourier features (Rahimi and Recht, NIPS 2007): wave vectors k ~ N(0, 1 / wavelength^2)
@@ -206,7 +208,7 @@ def _laplacian(points: np.ndarray, faces: np.ndarray, area: np.ndarray) -> csr_a
     return csr_array(diags_array(np.asarray(ways.sum(axis=1))) - ways)
 
 
-def _longest_edge_mm(part: Part, casting: Casting) -> float:
+def _longest_edge_mm(part: Part, casting: InvestmentCasting) -> float:
     """How long an edge of the casting may be to follow its shape."""
     length = float(part.extent_mm.max())
     edge = length / EDGES_PER_BOW if casting.bow_mm else math.inf

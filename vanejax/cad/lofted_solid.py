@@ -16,7 +16,7 @@ PROFILE = (0, 2)
 """The ring coordinates in which a platform's profile is drawn: axial and radius."""
 
 
-def loft(rings: np.ndarray, flat: tuple[int, int]) -> manifold3d.Manifold:
+def loft_sections(rings: np.ndarray, flat: tuple[int, int]) -> manifold3d.Manifold:
     """The solid whose skin joins rings of ring coordinates, in x, y, z about the engine's axis.
 
     Args:

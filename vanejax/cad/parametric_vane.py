@@ -17,7 +17,7 @@ import manifold3d
 import numpy as np
 
 from vanejax.cad.airfoil import Airfoil, require_number, require_simple
-from vanejax.cad.lofted_solid import PROFILE, SECTION, loft
+from vanejax.cad.lofted_solid import PROFILE, SECTION, loft_sections
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
 
@@ -201,18 +201,20 @@ def guide_vane(segment: GuideVaneSegment = DOUBLET) -> Part:
     vane = _vane_rings(segment)
     middle = _platform_middle(segment, vane)
     pitches = (np.arange(segment.vanes) - (segment.vanes - 1) / 2) * segment.pitch_rad
-    solids = [loft(vane + np.array([0, pitch, 0]), SECTION) for pitch in pitches]
+    solids = [loft_sections(vane + np.array([0, pitch, 0]), SECTION) for pitch in pitches]
     half_width = 0.5 * (segment.vanes * segment.pitch_rad - _gap_angle(segment))
     inner, outer, rail_slot = _platform_profiles(segment)
     solids += [
-        loft(_sweep(segment, profile, middle - half_width, middle + half_width), PROFILE)
+        loft_sections(_sweep(segment, profile, middle - half_width, middle + half_width), PROFILE)
         for profile in (inner, outer)
     ]
     solid = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
     if segment.slot_width_mm > 0:
         left = middle - 0.25 * segment.vanes * segment.pitch_rad
         width = segment.slot_width_mm / segment.outer_radius_mm
-        solid -= loft(_sweep(segment, rail_slot, left - width / 2, left + width / 2), PROFILE)
+        solid -= loft_sections(
+            _sweep(segment, rail_slot, left - width / 2, left + width / 2), PROFILE
+        )
     mesh = solid.simplify(_SLIVER_MM).to_mesh64()
     vertices = np.asarray(mesh.vert_properties)[:, :3]
     vertices = vertices - 0.5 * (vertices.min(0) + vertices.max(0))

@@ -11,7 +11,7 @@ from vanejax.errors import InputError
 from vanejax.plotting.canvas import INK, REFERENCE_RED, SOURCE_GREEN, new_figure
 from vanejax.plotting.shading import shade
 from vanejax.scanner.camera import Camera
-from vanejax.scanner.clutter import Scene
+from vanejax.scanner.clutter import ClutterScene
 from vanejax.scanner.virtual_scanner import Scan
 from vanejax.scans.segmentation import Segment, Segments
 
@@ -24,7 +24,7 @@ _COLORS = {
 _NAMES = {Segment.PART: "part", Segment.TABLE: "table", Segment.OTHER: "other things"}
 
 
-def segments_picture(scan: Scan, camera: Camera, scene: Scene, segments: Segments) -> Figure:
+def segments_picture(scan: Scan, camera: Camera, scene: ClutterScene, segments: Segments) -> Figure:
     """A scene as the camera sees it, coloured twice: by the segmentation, and by the truth.
 
     Args:
@@ -42,7 +42,7 @@ def segments_picture(scan: Scan, camera: Camera, scene: Scene, segments: Segment
         )
     owner = scene.owner(scan.face)
     kinds = [Segment.PART] + [
-        Segment.TABLE if extra.kind == "table" else Segment.OTHER for extra in scene.extras
+        Segment.TABLE if item.kind == "table" else Segment.OTHER for item in scene.objects
     ]
     truth = np.array(kinds, np.uint8)[owner]
     light = shade(scan, camera)

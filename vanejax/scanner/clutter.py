@@ -25,7 +25,7 @@ _RINGS, _SPOKES = 5, 16  # of a drop
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Extra:
+class ClutterObject:
     """A thing that is not the part.
 
     Attributes:
@@ -38,26 +38,26 @@ class Extra:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Scene:
+class ClutterScene:
     """A part and what is around it.
 
     Attributes:
       part: whose pose is asked for.
-      extras: what else is seen.
+      objects: what else is seen.
     """
 
     part: Part
-    extras: tuple[Extra, ...] = ()
+    objects: tuple[ClutterObject, ...] = ()
 
     @functools.cached_property
     def surface(self) -> Part:
         """All of it as one surface; the part's faces come first and keep their indices.
 
-        Without extras it is the part itself, so that its scans are the part's, bit for bit.
+        Without objects it is the part itself, so that its scans are the part's, bit for bit.
         """
-        if not self.extras:
+        if not self.objects:
             return self.part
-        meshes = [self.part.mesh, *(extra.mesh for extra in self.extras)]
+        meshes = [self.part.mesh, *(item.mesh for item in self.objects)]
         first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
         faces = [np.asarray(mesh.faces) + start for mesh, start in zip(meshes, first, strict=False)]
         # as in every part: what Embree sees
@@ -71,8 +71,8 @@ class Scene:
         return Scanner(self.surface)
 
     def owner(self, face: np.ndarray) -> np.ndarray:
-        """[N] i32, whose the faces [N] of a scan are: 0 the part's, k the k-th extra's (from 1)."""
-        counts = [len(self.part.mesh.faces), *(len(extra.mesh.faces) for extra in self.extras)]
+        """[N] i32, whose the faces [N] of a scan are: 0 the part's, k the k-th item's (from 1)."""
+        counts = [len(self.part.mesh.faces), *(len(item.mesh.faces) for item in self.objects)]
         return np.searchsorted(np.cumsum(counts), face, side="right").astype(np.int32)
 
 
@@ -103,20 +103,20 @@ class Clutter:
                 raise InputError(f"clutter: {name}={getattr(self, name)!r} must be 0 or more")
 
 
-def clutter_scene(part: Part, clutter: Clutter, rng: np.random.Generator) -> Scene:
+def clutter_scene(part: Part, clutter: Clutter, rng: np.random.Generator) -> ClutterScene:
     """The part among random things; the same state of ``rng`` gives the same scene."""
-    extras: tuple[Extra, ...] = ()
+    objects: tuple[ClutterObject, ...] = ()
     if clutter.table:
         tilt = clutter.tilt_deg * rng.random() if clutter.tilt_deg else 0.0
-        extras += (table(part, tilt_deg=tilt, azimuth_deg=360 * rng.random()),)
+        objects += (table(part, tilt_deg=tilt, azimuth_deg=360 * rng.random()),)
     if clutter.clamps:
-        extras += clamps(part, rng, clutter.clamps)
+        objects += clamps(part, rng, clutter.clamps)
     if clutter.chips or clutter.drops:
         # both fall on what stands already, not on each other: one scanner is enough
-        below = Scene(part, extras).scanner()
-        extras += chips(below, part, rng, clutter.chips)
-        extras += coolant_drops(below, part, rng, clutter.drops)
-    return Scene(part, extras)
+        below = ClutterScene(part, objects).scanner()
+        objects += chips(below, part, rng, clutter.chips)
+        objects += coolant_drops(below, part, rng, clutter.drops)
+    return ClutterScene(part, objects)
 
 
 def table(
@@ -126,7 +126,7 @@ def table(
     thickness_mm: float = 20.0,
     tilt_deg: float = 0.0,
     azimuth_deg: float = 0.0,
-) -> Extra:
+) -> ClutterObject:
     """A square plate under the part, which touches it at the part's lowest point.
 
     Args:
@@ -150,10 +150,10 @@ def table(
     middle = part.center + (lowest - part.center @ normal - thickness_mm / 2) * normal
     mesh = trimesh.creation.box((size_mm, size_mm, thickness_mm))
     vertices = part_from_plate.apply(mesh.vertices) + middle
-    return Extra("table", trimesh.Trimesh(vertices, mesh.faces, process=False))
+    return ClutterObject("table", trimesh.Trimesh(vertices, mesh.faces, process=False))
 
 
-def clamps(part: Part, rng: np.random.Generator, count: int) -> tuple[Extra, ...]:
+def clamps(part: Part, rng: np.random.Generator, count: int) -> tuple[ClutterObject, ...]:
     """Upright jaws that touch the part from the side, evenly around it.
 
     Each is a block 20 to 40 mm wide and 25 to 45 mm long, that stands where the part stands. Its
@@ -177,11 +177,13 @@ def clamps(part: Part, rng: np.random.Generator, count: int) -> tuple[Extra, ...
         box = trimesh.creation.box((length, width, top - bottom))
         place = np.array([out[contact] + length / 2, middle, (top + bottom) / 2])
         turned = (box.vertices + place) @ np.stack([outward, aside, [0.0, 0.0, 1.0]])
-        jaws.append(Extra("clamp", trimesh.Trimesh(turned, box.faces, process=False)))
+        jaws.append(ClutterObject("clamp", trimesh.Trimesh(turned, box.faces, process=False)))
     return tuple(jaws)
 
 
-def chips(below: Scanner, part: Part, rng: np.random.Generator, count: int) -> tuple[Extra, ...]:
+def chips(
+    below: Scanner, part: Part, rng: np.random.Generator, count: int
+) -> tuple[ClutterObject, ...]:
     """Curled swarf that fell from above: helical strips of 3 to 15 mm.
 
     Each is 0.5 to 2 mm wide and 0.1 to 0.3 mm thick, curled with a radius of 1 to 4 mm by half a
@@ -201,13 +203,13 @@ def chips(below: Scanner, part: Part, rng: np.random.Generator, count: int) -> t
         # what reaches beyond an edge hangs free, but not lower than the place itself
         clear = np.append(strip[:, 2] - ground, strip[:, 2].min() - place[2])
         strip[:, 2] -= clear.min()
-        fallen.append(Extra("chip", trimesh.Trimesh(strip, _strip_faces(), process=False)))
+        fallen.append(ClutterObject("chip", trimesh.Trimesh(strip, _strip_faces(), process=False)))
     return tuple(fallen)
 
 
 def coolant_drops(
     below: Scanner, part: Part, rng: np.random.Generator, count: int
-) -> tuple[Extra, ...]:
+) -> tuple[ClutterObject, ...]:
     """Drops on the upper surface: spherical caps of 1 to 5 mm radius along the surface's normal.
 
     The contact angle is 20 to 70 deg, so that they are a sixth to two thirds of their radius high.
@@ -223,7 +225,9 @@ def coolant_drops(
         cap = _cap(rng.uniform(1, 5), math.radians(rng.uniform(20, 70)))
         turn = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0]
         drops.append(
-            Extra("drop", trimesh.Trimesh(turn.apply(cap) + place, _cap_faces(), process=False))
+            ClutterObject(
+                "drop", trimesh.Trimesh(turn.apply(cap) + place, _cap_faces(), process=False)
+            )
         )
     return tuple(drops)
 

@@ -48,7 +48,7 @@ class Window(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Envelope:
+class PartEnvelope:
     """A convex polytope that contains a part with a margin.
 
     Attributes:
@@ -60,7 +60,7 @@ class Envelope:
     edges: np.ndarray
 
     @classmethod
-    def around(cls, vertices: np.ndarray) -> Envelope:
+    def around(cls, vertices: np.ndarray) -> PartEnvelope:
         """What `SIDES` planes that look in all directions leave of space when moved up to a part.
 
         Not the convex hull: that may have a corner for every vertex, and fails on a flat part.

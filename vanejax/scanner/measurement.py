@@ -155,10 +155,10 @@ class _Sensing:
     def measurement(self) -> Measurement:
         sensor = self.sensor
         self._drop_dark()
-        if sensor.lost_share:
-            lost = self.rng.random(len(self.reason), dtype=np.float32) < sensor.lost_share
+        if sensor.dropout_rate:
+            lost = self.rng.random(len(self.reason), dtype=np.float32) < sensor.dropout_rate
             self._drop(lost, Reason.LOST)
-        if sensor.rim_px:
+        if sensor.border_dropout_px:
             self._drop(self._at_outline(), Reason.LOST)
         kept = np.flatnonzero(self.reason == Reason.MEASURED)
         points = self._measured(kept)
@@ -173,7 +173,7 @@ class _Sensing:
     def _at_outline(self) -> np.ndarray:
         """[N] bool, the pixels whose window holds too much of what is not the part."""
         row, column = self._places()
-        return rim(row, column, self.sensor.rim_px * (1 + self._field(row, column)))
+        return rim(row, column, self.sensor.border_dropout_px * (1 + self._field(row, column)))
 
     def _places(self, which: slice | np.ndarray = slice(None)) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the pixels [N], or of some of them."""
@@ -191,16 +191,16 @@ class _Sensing:
         if sensor.shadow:
             lit = self.scanner.lit(points, normals, to_projector, scan.camera_from_part)
             self._drop(~lit, Reason.SHADOWED)
-        if sensor.most_incidence_deg < 90:
+        if sensor.max_incidence_deg < 90:
             inverse = 1 / np.sqrt(np.einsum("ni,ni->n", points, points))
             cosine = -np.einsum("ni,ni->n", points, normals) * inverse
             if sensor.incidence_spread_deg:
-                limit = sensor.most_incidence_deg + sensor.incidence_spread_deg * self._field(
+                limit = sensor.max_incidence_deg + sensor.incidence_spread_deg * self._field(
                     *self._places()
                 )
                 least = np.cos(np.radians(np.clip(limit, 0, 90)))
             else:
-                least = np.float32(math.cos(math.radians(sensor.most_incidence_deg)))
+                least = np.float32(math.cos(math.radians(sensor.max_incidence_deg)))
             self._drop(cosine < least, Reason.GRAZING)
         if sensor.exposure is not None:
             self._expose(sensor.exposure, to_projector)
@@ -235,16 +235,14 @@ class _Sensing:
             x = (column + np.float32(0.5)) / np.float32(camera.width / 2) - 1
             y = (row + np.float32(0.5)) / np.float32(camera.height / 2) - 1
             measured = measured + sensor.trueness.error_mm(measured, x, y).astype(np.float32)
-        if sensor.outlier_share:
-            far = np.flatnonzero(
-                self.rng.random(len(kept), dtype=np.float32) < sensor.outlier_share
-            )
+        if sensor.outlier_rate:
+            far = np.flatnonzero(self.rng.random(len(kept), dtype=np.float32) < sensor.outlier_rate)
             measured = measured.copy()
             measured[far] += np.float32(sensor.outlier_mm) * (
                 2 * self.rng.random(len(far), dtype=np.float32) - 1
             )
-        if sensor.step_mm:
-            step = np.float32(sensor.step_mm)
+        if sensor.depth_quantisation_mm:
+            step = np.float32(sensor.depth_quantisation_mm)
             measured = step * np.round(measured / step)
         if measured is not depth:
             points *= (measured / depth)[:, None]
@@ -262,8 +260,10 @@ class _Sensing:
         depth = -self.scan.points[:, 2]
         true = np.float32(sensor.focal_baseline) / depth
         aside = None
-        if sensor.adhesion_px:
-            aside = sensor.adhesion_px * np.stack([self._field(row, column) for _ in range(2)])
+        if sensor.edge_fattening_px:
+            aside = sensor.edge_fattening_px * np.stack(
+                [self._field(row, column) for _ in range(2)]
+            )
         mean = windowed(row, column, true, window_px=sensor.window_px, aside_px=aside)
         # a window over two surfaces that lie apart locks onto its own
         near = np.abs(np.float32(sensor.focal_baseline) / mean - depth) < sensor.jump_mm
@@ -280,21 +280,23 @@ class _Sensing:
         if sensor.correlated_px:
             field = self._field(*self._places(kept)) * np.float32(sensor.correlated_px)
             error = field if error is None else error + field
-        matched = sensor.window_px or sensor.adhesion_px
-        if error is None and not (sensor.mixed_share or sensor.step_px or matched):
+        matched = sensor.window_px or sensor.edge_fattening_px
+        if error is None and not (
+            sensor.flying_pixel_rate or sensor.disparity_quantisation_px or matched
+        ):
             return depth
         disparity = np.float32(sensor.focal_baseline) / depth
         if matched:
             disparity += self._window_shifts().take(kept)
         if error is not None:
             disparity += error
-        if sensor.mixed_share:
+        if sensor.flying_pixel_rate:
             pixel = self.scan.pixel.take(kept)
             sides = jumps(pixel, depth, width=sensor.camera.width, jump_mm=sensor.jump_mm)
-            mixed, added = mixed_disparity(rng, sides, disparity, share=sensor.mixed_share)
+            mixed, added = mixed_disparity(rng, sides, disparity, share=sensor.flying_pixel_rate)
             disparity[mixed] += added
-        if sensor.step_px:
-            step = np.float32(sensor.step_px)
+        if sensor.disparity_quantisation_px:
+            step = np.float32(sensor.disparity_quantisation_px)
             disparity = step * np.round(disparity / step)
         # no depth is measured beyond the far plane, and none from a disparity that is not positive
         least = np.float32(sensor.focal_baseline / (2 * sensor.camera.far_mm))

@@ -27,7 +27,7 @@ class Sensor:
       camera: intrinsics and clip planes.
       baseline_mm: from the camera to the projector, along the camera's +x (negative: to its left).
       shadow: whether what the projector does not see is left out.
-      most_incidence_deg: surfaces seen flatter are not measured; 90 for no limit.
+      max_incidence_deg: surfaces seen flatter are not measured; 90 for no limit.
       incidence_spread_deg: standard deviation of that limit from place to place, smooth over
         ``correlation_px``.
       exposure: light and shine; None: every surface is bright enough and none too bright.
@@ -38,18 +38,19 @@ class Sensor:
       correlation_px: its length, see `range_errors.smooth_field`.
       window_px: the matching window of a stereo camera, as the standard deviation of a Gaussian: it
         rounds edges off, see `range_errors.windowed`; 0 for a camera that codes single pixels.
-      adhesion_px: standard deviation, in columns and in rows, of how far beside its pixel the
+      edge_fattening_px: standard deviation, in columns and in rows, of how far beside its pixel the
         texture lies that a window matched; smooth over ``correlation_px``. The error grows with the
         slope of the surface.
-      rim_px: how wide a strip along the part's outline finds no match, on average; its width
+      border_dropout_px: mean width of the strip along the part's outline that finds no match; it
         varies as the correlated error does, see `range_errors.rim`.
-      mixed_share: of the places where the depth jumps, those where a pixel mixes both sides.
+      flying_pixel_rate: of the places where the depth jumps, those where a pixel mixes both sides.
       jump_mm: what difference of neighbouring depths is a jump.
-      step_px, step_mm: disparities, and depths, are rounded to multiples of it; 0 for none.
+      disparity_quantisation_px: disparities are rounded to multiples of it; 0 for none.
+      depth_quantisation_mm: depths are rounded to multiples of it; 0 for none.
       lens: what calibration leaves of the lens; None for nothing.
       trueness: what it leaves of the depth; None for nothing.
-      lost_share: of the pixels, lost singly.
-      outlier_share: of the measured points, those that lie anywhere within ``outlier_mm`` of depth.
+      dropout_rate: of the pixels, lost singly.
+      outlier_rate: of the measured points, those that lie anywhere within ``outlier_mm`` of depth.
       outlier_mm: largest error of an outlier.
 
     Raises:
@@ -59,41 +60,41 @@ class Sensor:
     camera: Camera = dataclasses.field(default_factory=Camera)
     baseline_mm: float = 120.0
     shadow: bool = False
-    most_incidence_deg: float = 90.0
+    max_incidence_deg: float = 90.0
     incidence_spread_deg: float = 0.0
     exposure: Exposure | None = None
     noise_px: float = 0.0
     correlated_px: float = 0.0
     correlation_px: float = 16.0
     window_px: float = 0.0
-    adhesion_px: float = 0.0
-    rim_px: float = 0.0
-    mixed_share: float = 0.0
+    edge_fattening_px: float = 0.0
+    border_dropout_px: float = 0.0
+    flying_pixel_rate: float = 0.0
     jump_mm: float = 2.0
-    step_px: float = 0.0
-    step_mm: float = 0.0
+    disparity_quantisation_px: float = 0.0
+    depth_quantisation_mm: float = 0.0
     lens: Lens | None = None
     trueness: Trueness | None = None
-    lost_share: float = 0.0
-    outlier_share: float = 0.0
+    dropout_rate: float = 0.0
+    outlier_rate: float = 0.0
     outlier_mm: float = 20.0
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.baseline_mm) and self.baseline_mm):
             raise InputError(f"sensor: baseline_mm={self.baseline_mm!r} must be a length, not 0")
-        if not 0 < self.most_incidence_deg <= 90:
+        if not 0 < self.max_incidence_deg <= 90:
             raise InputError(
-                f"sensor: most_incidence_deg={self.most_incidence_deg!r} must lie in (0, 90]"
+                f"sensor: max_incidence_deg={self.max_incidence_deg!r} must lie in (0, 90]"
             )
         for name in (
             "noise_px",
             "correlated_px",
             "incidence_spread_deg",
             "window_px",
-            "adhesion_px",
-            "rim_px",
-            "step_px",
-            "step_mm",
+            "edge_fattening_px",
+            "border_dropout_px",
+            "disparity_quantisation_px",
+            "depth_quantisation_mm",
             "outlier_mm",
             "jump_mm",
         ):
@@ -101,7 +102,7 @@ class Sensor:
                 raise InputError(f"sensor: {name}={getattr(self, name)!r} must be 0 or more")
         if not 1 <= self.correlation_px < math.inf:
             raise InputError(f"sensor: correlation_px={self.correlation_px!r} must be 1 or more")
-        for name in ("mixed_share", "lost_share", "outlier_share"):
+        for name in ("flying_pixel_rate", "dropout_rate", "outlier_rate"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(
                     f"sensor: {name}={getattr(self, name)!r} must be a share from 0 to 1"
@@ -130,9 +131,9 @@ class Sensor:
             correlated_px=self.correlated_px * factors,
             correlation_px=max(1.0, self.correlation_px * factors),
             window_px=self.window_px * factors,
-            adhesion_px=self.adhesion_px * factors,
-            rim_px=self.rim_px * factors,
-            step_px=self.step_px * factors,
+            edge_fattening_px=self.edge_fattening_px * factors,
+            border_dropout_px=self.border_dropout_px * factors,
+            disparity_quantisation_px=self.disparity_quantisation_px * factors,
             lens=lens,
         )
 
@@ -150,7 +151,7 @@ class Sensor:
         )
         return dataclasses.replace(self, exposure=exposure)
 
-    def another(self, rng: np.random.Generator, *, spread: float = 0.3) -> Sensor:
+    def sample(self, rng: np.random.Generator, *, spread: float = 0.3) -> Sensor:
         """Another camera of this kind, as its maker's next one would be.
 
         Errors of calibration are normally distributed with this sensor's as standard deviations;
@@ -194,9 +195,9 @@ class Sensor:
             noise_px=vary(self.noise_px),
             correlated_px=vary(self.correlated_px),
             correlation_px=max(1.0, vary(self.correlation_px)),
-            mixed_share=min(1.0, vary(self.mixed_share)),
-            lost_share=min(1.0, vary(self.lost_share)),
-            outlier_share=min(1.0, vary(self.outlier_share)),
+            flying_pixel_rate=min(1.0, vary(self.flying_pixel_rate)),
+            dropout_rate=min(1.0, vary(self.dropout_rate)),
+            outlier_rate=min(1.0, vary(self.outlier_rate)),
         )
 
 
@@ -217,17 +218,17 @@ def paper_camera() -> Sensor:
         camera=dataclasses.replace(Camera(), near_mm=200.0),
         baseline_mm=120.0,
         shadow=True,
-        most_incidence_deg=78.0,
+        max_incidence_deg=78.0,
         exposure=Exposure(),
         noise_px=0.05,
         correlated_px=0.02,
         correlation_px=16.0,
-        mixed_share=0.5,
-        step_px=1 / 64,
+        flying_pixel_rate=0.5,
+        disparity_quantisation_px=1 / 64,
         lens=Lens(k1=1e-3, k2=1e-3, p1=1e-4, p2=1e-4, focal_error=1e-4, center_error_px=(0.1, 0.1)),
         trueness=Trueness(scale=1e-4, bend_mm=(0.02, 0.02)),
-        lost_share=2e-3,
-        outlier_share=5e-4,
+        dropout_rate=2e-3,
+        outlier_rate=5e-4,
     )
 
 
@@ -251,18 +252,18 @@ def consumer_depth() -> Sensor:
         ),
         baseline_mm=18.0,
         shadow=True,
-        most_incidence_deg=76.0,
+        max_incidence_deg=76.0,
         incidence_spread_deg=10.0,
         noise_px=0.005,
         correlated_px=0.044,
         correlation_px=14.0,
         window_px=2.6,
-        adhesion_px=1.1,
-        rim_px=0.87,
-        mixed_share=0.5,
+        edge_fattening_px=1.1,
+        border_dropout_px=0.87,
+        flying_pixel_rate=0.5,
         jump_mm=10.0,
-        step_mm=1.0,
-        lost_share=0.017,
+        depth_quantisation_mm=1.0,
+        dropout_rate=0.017,
     )
 
 

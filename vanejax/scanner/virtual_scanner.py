@@ -30,7 +30,7 @@ from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, Viewpoints
-from vanejax.scanner.image_window import Envelope, Window
+from vanejax.scanner.image_window import PartEnvelope, Window
 from vanejax.scanner.pixel_rays import EDGE_ON_COSINE, MeasuredPixels, PixelRays
 
 T = TypeVar("T")
@@ -105,7 +105,7 @@ class Scanner:
         self._center = np.asarray(part.center, np.float64)
         vertices = np.asarray(part.mesh.vertices, np.float64) - self._center
         self._radius = float(np.linalg.norm(vertices, axis=-1).max())
-        self._envelope = Envelope.around(vertices)
+        self._envelope = PartEnvelope.around(vertices)
         self._planes = np.empty((len(part.mesh.faces), 4))
         for faces, corners in self._triangles():
             self._planes[faces] = _planes_of(corners)

@@ -87,7 +87,7 @@ class ScanStream:
     Attributes:
       part: the CAD model: frame, centre and radius.
       reference: [Y] its thinned surface on the device, unit-sphere units.
-      sensor: each scan is by `Sensor.another` one of this kind.
+      sensor: each scan is by `Sensor.sample` one of this kind.
       views: from where.
       castings: scanners of the parts that are scanned, by turns: the CAD model's own, or castings
         that differ from it.
@@ -122,7 +122,7 @@ class ScanStream:
         for _ in range(ATTEMPTS):
             camera_from_part = self.views.draw(rng, self.part.center)
             distance = float(np.linalg.norm(camera_from_part.apply(self.part.center[None])))
-            sensor = self.sensor.another(rng).exposed_for(distance)
+            sensor = self.sensor.sample(rng).exposed_for(distance)
             try:
                 points = measure(scanner, sensor, camera_from_part, rng).points
             except InputError:  # the part is outside the image

@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from experiments.runner import study_command as study
-from experiments.runner.vane_views import VaneViews, beside
+from experiments.runner.vane_views import VaneViews, perturb
 from experiments.studies.density.report import (
     CANCELLED,
     LEGEND,
@@ -155,7 +155,7 @@ def measure(
 
 def _poses(views: VaneViews, view: int, rng: np.random.Generator) -> list[RigidTransform]:
     truth = views.truth(view)
-    return [beside(truth, views.part, deg=deg, mm=mm, rng=rng) for deg, mm in ERRORS]
+    return [perturb(truth, views.part, deg=deg, mm=mm, rng=rng) for deg, mm in ERRORS]
 
 
 def slope(sizes: Sequence[int], means: np.ndarray) -> float:

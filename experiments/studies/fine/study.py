@@ -24,7 +24,7 @@ from scipy import stats
 from tqdm import tqdm
 
 from experiments.runner import study_command as study
-from experiments.runner.vane_views import VaneViews, beside, magnitudes, pose_error, with_noise
+from experiments.runner.vane_views import VaneViews, magnitudes, perturb, pose_error, with_noise
 from vanejax.localization.covariance import uncertainty
 from vanejax.localization.fine_registration import refine
 from vanejax.localization.residuals import RayCasting
@@ -103,7 +103,7 @@ def refine_view(
     """Adds noise to the ideal points [N, 3] of a view and refines from beside the true pose."""
     rng = np.random.default_rng([seed, view, round(1e6 * noise_mm)])  # levels are independent
     part, truth = views.part, views.truth(view)
-    start = beside(truth, part, deg=start_deg, mm=start_mm, rng=rng)
+    start = perturb(truth, part, deg=start_deg, mm=start_mm, rng=rng)
     points = with_noise(ideal, noise_mm, rng)
     began = time.perf_counter()
     found = refine(views.model, points, start)

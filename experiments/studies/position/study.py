@@ -286,7 +286,7 @@ def run_camera(
     rng = np.random.default_rng([seed, _STAND, view])
     kind = preset(SENSOR)
     camera_from_part = views.viewpoints.view(view)
-    one = Stand.built(views.part, kind.another(rng), camera_from_part, rng)
+    one = Stand.built(views.part, kind.sample(rng), camera_from_part, rng)
     errors = stand.causes(kind)
     turned, moved = stand.turns(positions), stand.moves(positions)
     shared = {"errors": errors, "weights": weights, "seed": seed}

@@ -278,7 +278,7 @@ def calibrations(placed: list[Placed]) -> tuple[Calibration, Calibration]:
 def causes(kind: Sensor) -> list[Sensor]:
     """A kind of camera with one error of its calibration each, of one standard deviation.
 
-    Those that `Sensor.another` draws.
+    Those that `Sensor.sample` draws.
     """
     bare = dataclasses.replace(kind, lens=None, trueness=None)
     found = []

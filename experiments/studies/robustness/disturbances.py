@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from vanejax.cad.investment_casting import Casting, as_cast
+from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cad.part import Part
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import hemisphere_viewpoints
@@ -173,7 +173,7 @@ class _Stand:
         rng = self._rng(2, number)
         pose = self._pose(rng)
         sensor = saturating(
-            self.scanner, self.sensor.another(rng), pose, percent / 100, seed=self.seed
+            self.scanner, self.sensor.sample(rng), pose, percent / 100, seed=self.seed
         )
         return self._scan(rng, pose, sensor=sensor)
 
@@ -187,7 +187,7 @@ class _Stand:
     def as_cast(self, allowance_mm: float, number: int) -> Disturbed:
         rng = self._rng(5, number)
         pose = self._pose(rng)
-        casting = Casting(
+        casting = InvestmentCasting(
             allowance_mm=allowance_mm / 2, waviness_mm=allowance_mm / 6, wavelength_mm=30.0
         )
         return self._scan(rng, pose, scanner=Scanner(as_cast(self.part, casting, rng)))
@@ -196,7 +196,7 @@ class _Stand:
         rng = self._rng(6, number)
         pose = self._pose(rng)
         sensor = dataclasses.replace(
-            self.sensor.another(rng), correlated_px=pixels, correlation_px=40.0
+            self.sensor.sample(rng), correlated_px=pixels, correlation_px=40.0
         )
         return self._scan(rng, pose, sensor=sensor)
 
@@ -215,7 +215,7 @@ class _Stand:
     def _cluttered(self, rng: np.random.Generator, clutter: Clutter) -> Disturbed:
         pose = self._pose(rng)
         scene = clutter_scene(self.part, clutter, rng)
-        measured = measure(scene.scanner(), self.sensor.another(rng), pose, rng)
+        measured = measure(scene.scanner(), self.sensor.sample(rng), pose, rng)
         points = measured.points.astype(np.float64)
         part = segment(points, self.part, sensor_origin=np.zeros(3)).part
         foreign = scene.owner(measured.face)[part] > 0
@@ -230,7 +230,7 @@ class _Stand:
         scanner: Scanner | None = None,
         distance_mm: float = DISTANCE_MM,
     ) -> Disturbed:
-        sensor = sensor or self.sensor.another(rng).exposed_for(distance_mm)
+        sensor = sensor or self.sensor.sample(rng).exposed_for(distance_mm)
         measured = measure(scanner or self.scanner, sensor, pose, rng)
         return Disturbed(measured.points.astype(np.float64), pose.inverse(), measured, 0.0)
 

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from experiments.runner import study_command as study
-from experiments.runner.vane_views import beside, magnitudes, pose_error
+from experiments.runner.vane_views import magnitudes, perturb, pose_error
 from experiments.studies.density.study import fit
 from experiments.studies.robustness import report as robustness_report
 from experiments.studies.robustness.disturbances import Disturbed, Series, make_series
@@ -106,7 +106,7 @@ class Trial:
 
 def _rough(truth: RigidTransform, part: Part, rng: np.random.Generator) -> RigidTransform:
     """A pose up to 45 deg and half a radius away from the true one."""
-    return beside(
+    return perturb(
         truth,
         part,
         deg=rng.uniform(0, START_DEG),
@@ -143,7 +143,7 @@ def run_random(part: Part, matcher: TrainedMatcher, count: int, seed: int) -> di
         rng = np.random.default_rng([seed, _RANDOM, number])
         pose = views.draw(rng, part.center)
         distance = float(np.linalg.norm(pose.apply(part.center[None])))
-        measured = measure(scanner, kind.another(rng).exposed_for(distance), pose, rng)
+        measured = measure(scanner, kind.sample(rng).exposed_for(distance), pose, rng)
         truth = pose.inverse()
         init = _rough(truth, part, rng)
         scan = MeasuredScan(measured.points.astype(np.float64), None, np.zeros(3))

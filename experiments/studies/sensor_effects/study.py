@@ -45,7 +45,7 @@ def effects() -> dict[str, Sensor]:
     return {
         "ideal": bare,
         "projector shadow": only(shadow=True),
-        "grazing dropout": only(most_incidence_deg=full.most_incidence_deg),
+        "grazing dropout": only(max_incidence_deg=full.max_incidence_deg),
         "light": only(exposure=exposure),
         "strong light": only(exposure=dataclasses.replace(exposure, exposure_ms=STRONG_MS)),
         "range noise": only(noise_px=full.noise_px),
@@ -53,11 +53,11 @@ def effects() -> dict[str, Sensor]:
             correlated_px=full.correlated_px, correlation_px=full.correlation_px
         ),
         "matching window": only(window_px=2.0),
-        "mixed pixels": only(mixed_share=full.mixed_share),
-        "steps of disparity": only(step_px=full.step_px),
+        "mixed pixels": only(flying_pixel_rate=full.flying_pixel_rate),
+        "steps of disparity": only(disparity_quantisation_px=full.disparity_quantisation_px),
         "lens": only(lens=full.lens),
         "trueness": only(trueness=full.trueness),
-        "lost, outliers": only(lost_share=0.02, outlier_share=0.01),
+        "lost, outliers": only(dropout_rate=0.02, outlier_rate=0.01),
         "all": full,
     }
 

@@ -51,15 +51,15 @@ WIDTH, HEIGHT = 424, 240
 EFFECTS: dict[str, tuple[str, ...]] = {
     "noise": ("noise_px",),
     "correlated": ("correlated_px",),
-    "window": ("window_px", "adhesion_px"),
-    "mixed": ("mixed_share",),
-    "steps": ("step_mm",),
+    "window": ("window_px", "edge_fattening_px"),
+    "mixed": ("flying_pixel_rate",),
+    "steps": ("depth_quantisation_mm",),
     "dropout": (
         "shadow",
-        "most_incidence_deg",
+        "max_incidence_deg",
         "incidence_spread_deg",
-        "rim_px",
-        "lost_share",
+        "border_dropout_px",
+        "dropout_rate",
     ),
 }
 START = {
@@ -67,15 +67,24 @@ START = {
     "correlated_px": 0.06,
     "correlation_px": 10.0,
     "window_px": 2.0,
-    "adhesion_px": 1.5,
-    "rim_px": 1.0,
-    "mixed_share": 0.5,
+    "edge_fattening_px": 1.5,
+    "border_dropout_px": 1.0,
+    "flying_pixel_rate": 0.5,
     "jump_mm": 8.0,
-    "lost_share": 0.015,
+    "dropout_rate": 0.015,
     "incidence_spread_deg": 8.0,
-    "most_incidence_deg": 77.0,
+    "max_incidence_deg": 77.0,
 }
 """Where the search begins: guessed from the pictures of the residuals."""
+RECORDED_AS = {
+    "edge_fattening_px": "adhesion_px",
+    "border_dropout_px": "rim_px",
+    "flying_pixel_rate": "mixed_share",
+    "depth_quantisation_mm": "step_mm",
+    "max_incidence_deg": "most_incidence_deg",
+    "dropout_rate": "lost_share",
+}
+"""Names of the sensor's fields in results, which keep those of the first record."""
 SHOWN = ("Separator_2", "Range_Hood_4")
 """In the picture: two that the preset was not fitted to."""
 
@@ -161,9 +170,9 @@ def with_values(sensor: Sensor, values: Mapping[str, float]) -> Sensor:
     """The sensor with other magnitudes, each held within what a sensor can have."""
     bounds = {
         "correlation_px": (1.0, 100.0),
-        "mixed_share": (0.0, 1.0),
-        "lost_share": (0.0, 1.0),
-        "most_incidence_deg": (30.0, 90.0),
+        "flying_pixel_rate": (0.0, 1.0),
+        "dropout_rate": (0.0, 1.0),
+        "max_incidence_deg": (30.0, 90.0),
     }
     limited = {
         name: float(np.clip(value, *bounds.get(name, (0.0, 100.0))))
@@ -187,7 +196,7 @@ def fit(
         return with_values(sensor, dict(zip(names, np.exp(place), strict=True)))
 
     best = np.log(list(start.values()))
-    sizes = np.diag([-0.06 if name == "most_incidence_deg" else 0.4 for name in names])
+    sizes = np.diag([-0.06 if name == "max_incidence_deg" else 0.4 for name in names])
     for size in (sizes, -sizes):
         best = minimize(
             lambda place: unlike(there(place)),
@@ -330,7 +339,11 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
         print("\n".join(f"{name}={getattr(full, name):.3g}" for name in START))
     # other random numbers than the search had
     figures, taken = measure(scans, real, full, settings.seed + 1)
-    values = {name: getattr(full, name) for effect in EFFECTS.values() for name in effect}
+    values = {
+        RECORDED_AS.get(name, name): getattr(full, name)
+        for effect in EFFECTS.values()
+        for name in effect
+    }
     head = study.header("statistics of residuals at the refined true pose", settings)
     report = head | {
         "grid": dataclasses.asdict(grid),

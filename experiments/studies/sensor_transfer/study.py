@@ -31,7 +31,7 @@ from experiments.runner.experiment import (
 )
 from experiments.runner.online import EndlessSettings
 from experiments.runner.run_folder import RunFolder
-from experiments.runner.vane_views import beside
+from experiments.runner.vane_views import perturb
 from experiments.studies.real_scans.study import RIGHT_DEG, RIGHT_MM, Known, load_truth
 from experiments.train import fit, load_or_scan
 from vanejax.cad.part import Part
@@ -122,7 +122,7 @@ class Trial:
     def _start(self, known: Known, rng: np.random.Generator) -> RigidTransform:
         """A pose beside one of the right ones."""
         right = known.camera_from_part[rng.integers(len(known.camera_from_part))]
-        return beside(
+        return perturb(
             RigidTransform.from_matrix(right).inverse(),
             self.part,
             deg=rng.uniform(0, START_DEG),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.runner.vane_views import VaneViews, beside, magnitudes, pose_error, with_noise
+from experiments.runner.vane_views import VaneViews, magnitudes, perturb, pose_error, with_noise
 from experiments.studies.fine import study as fine
 from experiments.studies.fine.study import (
     Fit,
@@ -65,14 +65,14 @@ def test_a_start_is_as_far_off_as_it_says(views: VaneViews) -> None:
     truth, center = views.truth(VIEW), views.part.center
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        start = beside(truth, views.part, deg=5.0, mm=3.0, rng=rng)
+        start = perturb(truth, views.part, deg=5.0, mm=3.0, rng=rng)
         assert magnitudes(pose_error(start, truth, center)) == pytest.approx((5.0, 3.0), abs=1e-9)
 
 
 def test_the_error_undoes_itself(views: VaneViews) -> None:
     """Applied to what was found as `residuals.moved` does, it gives the truth."""
     truth = views.truth(VIEW)
-    found = beside(truth, views.part, deg=20.0, mm=9.0, rng=np.random.default_rng(3))
+    found = perturb(truth, views.part, deg=20.0, mm=9.0, rng=np.random.default_rng(3))
     error = pose_error(found, truth, views.part.center)
     again = moved(views.part, one(found), error[None])
     np.testing.assert_allclose(again.rotation[0], truth.rotation, atol=1e-12)

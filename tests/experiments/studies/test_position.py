@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from experiments.runner.vane_views import VaneViews, beside, magnitudes, pose_error
+from experiments.runner.vane_views import VaneViews, magnitudes, perturb, pose_error
 from experiments.studies.position import report as position_report
 from experiments.studies.position import study as position
 from experiments.studies.position import virtual_stand as stand
@@ -229,7 +229,7 @@ def report() -> dict[str, Any]:
     def guessed(scan, part, *, init, **settings):
         if init is None:
             truth = VIEWS.truth(VIEW)
-            init = beside(truth, part, deg=3, mm=3, rng=np.random.default_rng(0))
+            init = perturb(truth, part, deg=3, mm=3, rng=np.random.default_rng(0))
         return register(scan, part, init=init, **settings)
 
     with pytest.MonkeyPatch.context() as patch:

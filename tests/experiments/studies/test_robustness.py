@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.runner.vane_views import beside
+from experiments.runner.vane_views import perturb
 from experiments.studies.robustness import report as robustness_report
 from experiments.studies.robustness import study as robustness
 from experiments.studies.robustness.disturbances import make_series
@@ -150,7 +150,7 @@ def trial(monkeypatch) -> Trial:
     )
     monkeypatch.setattr(robustness, "match_poses", lambda matcher, scan, guess, **_: guess)
     monkeypatch.setattr(
-        robustness, "_rough", lambda truth, part, rng: beside(truth, part, deg=1, mm=1, rng=rng)
+        robustness, "_rough", lambda truth, part, rng: perturb(truth, part, deg=1, mm=1, rng=rng)
     )
     return Trial(part, {"guess": network})
 
