@@ -31,7 +31,7 @@ WINGS = [
     "report",
     "cli",
 ]
-GROUND = ["errors", "files", "rigid", "pointcloud", "compilation_cache"]
+GROUND = ["errors", "settings", "files", "rigid", "pointcloud", "compilation_cache"]
 # needs no JAX, so that a command line without networks starts a second earlier
 HOST_WINGS = ["cad", "scanner", "scans", "localization", "machine"]
 # what brings JAX when it is asked for: normals for networks, and the poses that networks find

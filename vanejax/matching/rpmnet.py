@@ -36,6 +36,7 @@ from vanejax.matching.torch_weights import (
 )
 from vanejax.pointcloud import PointCloud, ball_query
 from vanejax.rigid import RigidTransform
+from vanejax.settings import Settings, multiple_of, positive, settings_class
 
 
 @flax.struct.dataclass
@@ -129,20 +130,25 @@ class AnnealingNet(nn.Module):
         return beta, alpha
 
 
-class RpmNet(nn.Module):
-    """RPM-Net for one pair; `jax.vmap` over pairs.
+@settings_class
+class RpmNetSettings(Settings):
+    """What an RPM-Net is made of.
 
     Attributes:
       num_neighbors: K, the paper's k.
       radius: of the neighbourhood, unit-sphere units.
       sinkhorn_iterations: rounds of normalisation.
-      feature_width: channels of a feature.
+      feature_width: channels of a feature; the normalisation has 8 groups of them.
     """
 
-    num_neighbors: int = 32
-    radius: float = 0.3
-    sinkhorn_iterations: int = 5
-    feature_width: int = 96
+    num_neighbors: int = positive(32)
+    radius: float = positive(0.3)
+    sinkhorn_iterations: int = positive(5)
+    feature_width: int = multiple_of(8, 96)
+
+
+class RpmNet(RpmNetSettings, nn.Module):
+    """RPM-Net for one pair; `jax.vmap` over pairs. Its fields are `RpmNetSettings`."""
 
     def setup(self) -> None:
         """Names the two networks."""

@@ -17,6 +17,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from vanejax.errors import InputError
 from vanejax.matching.baselines.dgcnn import Dgcnn
 from vanejax.matching.baselines.transformer import Encoded, Transformer
 from vanejax.matching.contract import Register, Registration
@@ -24,6 +25,7 @@ from vanejax.matching.iteration import last_iteration
 from vanejax.matching.procrustes import weighted_procrustes
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
+from vanejax.settings import Settings, positive, settings_class
 
 _MASKED = -1e9
 
@@ -61,8 +63,9 @@ class Match:
         return jax.nn.log_softmax(self.scores, axis=1)
 
 
-class Dcp(nn.Module):
-    """DCP for one pair; `jax.vmap` over pairs.
+@settings_class
+class DcpSettings(Settings):
+    """What a DCP is made of; the defaults are as published.
 
     Attributes:
       width: channels of a feature.
@@ -71,10 +74,22 @@ class Dcp(nn.Module):
       hidden: channels inside a feed-forward layer.
     """
 
-    width: int = 512
-    num_neighbors: int = 20
-    heads: int = 4
-    hidden: int = 1024
+    width: int = positive(512)
+    num_neighbors: int = positive(20)
+    heads: int = positive(4)
+    hidden: int = positive(1024)
+
+    def check(self, path: str = "") -> None:
+        """As `Settings.check`; the heads divide the width."""
+        super().check(path)
+        if self.width % self.heads:
+            raise InputError(
+                f"{path}.width={self.width} must be a multiple of {path}.heads={self.heads}"
+            )
+
+
+class Dcp(DcpSettings, nn.Module):
+    """DCP for one pair; `jax.vmap` over pairs. Its fields are `DcpSettings`."""
 
     def setup(self) -> None:
         """Names the two networks."""

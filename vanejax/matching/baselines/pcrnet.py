@@ -27,19 +27,30 @@ from vanejax.matching.contract import Register, Registration
 from vanejax.matching.se3 import hat
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
+from vanejax.settings import Settings, bounded, settings_class
 
 
-class PcrNet(nn.Module):
-    """PCRNet for one pair; `jax.vmap` over pairs.
-
-    The pose is held constant between iterations when gradients are taken. The dropout that is
-    published for noisy data is left out: it needs keys, and the pairs drawn here never repeat.
+@settings_class
+class PcrNetSettings(Settings):
+    """What a PCRNet is made of; the default is as published.
 
     Attributes:
       head: channels of the hidden layers that read the pose.
     """
 
-    head: tuple[int, ...] = (1024, 1024, 512, 512, 256)
+    head: tuple[int, ...] = bounded(
+        (1024, 1024, 512, 512, 256),
+        lambda widths: len(widths) > 0 and min(widths) > 0,
+        "be positive numbers",
+    )
+
+
+class PcrNet(PcrNetSettings, nn.Module):
+    """PCRNet for one pair; `jax.vmap` over pairs. Its fields are `PcrNetSettings`.
+
+    The pose is held constant between iterations when gradients are taken. The dropout that is
+    published for noisy data is left out: it needs keys, and the pairs drawn here never repeat.
+    """
 
     def setup(self) -> None:
         """The encoder, the head and its last layer."""

@@ -10,7 +10,7 @@ is 1.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import flax.linen as nn
 import flax.struct
@@ -28,6 +28,7 @@ from vanejax.matching.contract import Register, Registration
 from vanejax.matching.se3 import exp_se3
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
+from vanejax.settings import Settings, not_negative, one_of, positive, settings_class
 
 _EXACT = jax.lax.Precision.HIGHEST
 
@@ -62,11 +63,9 @@ class LucasKanadeSteps:
     residual: jax.Array
 
 
-class PointNetLK(nn.Module):
-    """PointNetLK for one pair; `jax.vmap` over pairs.
-
-    The pose is held constant between iterations when gradients are taken, as in RPM-Net; the
-    published code differentiates through all of them.
+@settings_class
+class PointNetLKSettings(Settings):
+    """What a PointNetLK is made of.
 
     Attributes:
       delta: step of the Jacobian's differences: radians, and the clouds' unit.
@@ -76,9 +75,17 @@ class PointNetLK(nn.Module):
         iterations have to undo. "target": both on the target's mean.
     """
 
-    delta: float = 0.01
-    damping: float = 1e-6
-    origin: Literal["means", "target"] = "means"
+    delta: float = positive(0.01)
+    damping: float = not_negative(1e-6)
+    origin: str = one_of("means", "target")
+
+
+class PointNetLK(PointNetLKSettings, nn.Module):
+    """PointNetLK for one pair; `jax.vmap` over pairs. Its fields are `PointNetLKSettings`.
+
+    The pose is held constant between iterations when gradients are taken, as in RPM-Net; the
+    published code differentiates through all of them.
+    """
 
     def setup(self) -> None:
         """The encoder."""
