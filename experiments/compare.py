@@ -27,6 +27,7 @@ from experiments.runner import study_command as study
 from experiments.runner.evaluation_report import hardest_views, summarize
 from experiments.runner.machine import cores, cpu_model, peer_versions
 from experiments.runner.registrations import Results, register_views
+from experiments.runner.required_accuracy import NEED_DEG, NEED_MM, within_need
 from experiments.runner.run_folder import git_commit, versions
 from experiments.runner.trained import Trained, given_runs, trained
 from experiments.studies.comparison import pictures as comparison_pictures
@@ -40,8 +41,6 @@ from vanejax.files import write_text
 from vanejax.matching.metrics import summary
 from vanejax.training.dataset import ScanSet
 from vanejax.training.pairs import make_bank
-
-NEED_DEG, NEED_MM = 0.5, 1.0  # what the paper's machining process asks for
 
 
 def compare(
@@ -132,10 +131,8 @@ def figures(results: Results, scans: ScanSet) -> dict[str, Any]:
     """Summaries over all views and the hardest, the success rate, and every view's pose error."""
     found = summarize(results, scans)
     rotation, translation = results.errors.rotation_deg, results.errors.translation_mm
-    # NaN is no success
-    success = (rotation < NEED_DEG) & (translation < NEED_MM)
     return {
-        "success": np.mean(success),
+        "success": np.mean(within_need(rotation, translation)),
         "non_finite_views": found["non_finite_views"],
         "summary": found["summary"],
         "hardest": found["hardest"]["summary"],

@@ -30,11 +30,15 @@ class CountedRays(RayCasting):
     rays: list[int] = dataclasses.field(default_factory=list)
 
     def residuals(
-        self, part_from_camera: RigidTransform, points: np.ndarray, *, feet: Precision = "faces"
+        self,
+        part_from_camera: RigidTransform,
+        points: np.ndarray,
+        *,
+        precision: Precision = "faces",
     ) -> Residuals:
         """See `RayCasting`."""
         self.rays.append(len(part_from_camera.rotation) * len(points))
-        return super().residuals(part_from_camera, points, feet=feet)
+        return super().residuals(part_from_camera, points, precision=precision)
 
 
 def bare_scene(part: Part) -> EmbreeScene:

@@ -28,9 +28,9 @@ def test_no_face_is_nearer(vane: Part, spread_mm: float) -> None:
     rng = np.random.default_rng(0)
     start, _, _ = vane.sample(25, seed=1)
     points = start + rng.normal(0, spread_mm, start.shape)
-    feet = NearestFace(vane).feet(points)
+    closest = NearestFace(vane).closest_points(points)
     corners = np.asarray(vane.mesh.triangles)
-    for point, foot, face in zip(points, feet.points, feet.face, strict=True):
+    for point, foot, face in zip(points, closest.points, closest.face, strict=True):
         every = closest_point(corners, np.broadcast_to(point, (len(corners), 3)))
         least = np.linalg.norm(every - point, axis=1).min()
         assert np.linalg.norm(foot - point) == pytest.approx(least, rel=1e-12, abs=1e-12)
@@ -40,8 +40,8 @@ def test_no_face_is_nearer(vane: Part, spread_mm: float) -> None:
 def test_points_of_the_surface_are_on_it(vane: Part) -> None:
     """Where the samples of `Surface.exact` miss long thin faces by up to a millimetre."""
     points, _, _ = vane.sample(3_000, seed=2)
-    feet = NearestFace(vane).feet(points)
-    np.testing.assert_allclose(feet.points, points, rtol=0, atol=1e-12)
+    closest = NearestFace(vane).closest_points(points)
+    np.testing.assert_allclose(closest.points, points, rtol=0, atol=1e-12)
 
 
 def test_the_sides_of_a_box_edges_and_corners_too(box: Part) -> None:
@@ -52,10 +52,10 @@ def test_the_sides_of_a_box_edges_and_corners_too(box: Part) -> None:
     beyond = np.abs(points) - half
     outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
     truth = np.where((beyond < 0).all(axis=1), beyond.max(axis=1), outside)
-    feet = NearestFace(box).feet(points)
-    off = points - feet.points
+    closest = NearestFace(box).closest_points(points)
+    off = points - closest.points
     np.testing.assert_allclose(np.linalg.norm(off, axis=1), np.abs(truth), rtol=0, atol=1e-12)
-    side = np.einsum("ni,ni->n", off, feet.normals)
+    side = np.einsum("ni,ni->n", off, closest.normals)
     assert np.count_nonzero(truth > 0) > 400
     assert np.count_nonzero(truth < 0) > 400
     assert (np.sign(side) == np.sign(truth))[np.abs(truth) > 1e-9].all()
@@ -64,9 +64,9 @@ def test_the_sides_of_a_box_edges_and_corners_too(box: Part) -> None:
 def test_more_points_than_go_at_once(box: Part, monkeypatch) -> None:
     points, _, _ = box.sample(100, seed=0)
     points = points + 1.5
-    whole = NearestFace(box).feet(points)
+    whole = NearestFace(box).closest_points(points)
     monkeypatch.setattr("vanejax.cad.nearest_face.PAIRS_AT_ONCE", 64)
-    parts = NearestFace(box).feet(points)
+    parts = NearestFace(box).closest_points(points)
     for name in ("points", "normals", "face"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))
 
@@ -75,9 +75,9 @@ def test_a_face_without_area_does_no_harm() -> None:
     """Such faces stay in an open surface: the two that are left are looked at."""
     vertices = np.array([[0.0, 0, 0], [30, 0, 0], [30, 30, 0], [0, 30, 0], [15, 0, 0]])
     mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [0, 2, 3], [0, 4, 1]], process=False)
-    feet = NearestFace(Part(mesh=mesh, name="sheet", notes=(), closed=False)).feet(
+    closest = NearestFace(Part(mesh=mesh, name="sheet", notes=(), closed=False)).closest_points(
         np.array([[10.0, 5, 2], [40.0, 5, 0], [14.0, -5, 0]])
     )
     expected = [[10, 5, 0], [30, 5, 0], [14, 0, 0]]
-    np.testing.assert_allclose(feet.points, expected, rtol=0, atol=1e-12)
-    assert set(feet.face) <= {0, 1}
+    np.testing.assert_allclose(closest.points, expected, rtol=0, atol=1e-12)
+    assert set(closest.face) <= {0, 1}

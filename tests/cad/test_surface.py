@@ -16,8 +16,8 @@ def distance_to_every_triangle(part: Part, points: np.ndarray) -> np.ndarray:
     triangles = np.asarray(part.mesh.triangles)
     distance = []
     for point in points:
-        feet = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
-        distance.append(np.linalg.norm(feet - point, axis=1).min())
+        closest = closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
+        distance.append(np.linalg.norm(closest - point, axis=1).min())
     return np.array(distance)
 
 
@@ -36,24 +36,24 @@ def surface(part: Part) -> Surface:
 def test_exact_feet_are_on_the_surface_of_the_face_that_they_name(make):
     part = make()
     points = around(part, 500, 0.2)
-    feet = surface(part).exact(points)
-    corners = np.asarray(part.mesh.triangles)[feet.face]
+    closest = surface(part).exact(points)
+    corners = np.asarray(part.mesh.triangles)[closest.face]
     again = closest_point(corners, points)
-    np.testing.assert_allclose(feet.points, again, atol=1e-9)  # f64 eps x 100 mm x 100
-    np.testing.assert_allclose(feet.normals, part.mesh.face_normals[feet.face], atol=1e-12)
+    np.testing.assert_allclose(closest.points, again, atol=1e-9)  # f64 eps x 100 mm x 100
+    np.testing.assert_allclose(closest.normals, part.mesh.face_normals[closest.face], atol=1e-12)
 
 
 def test_exact_is_the_nearest_of_all_triangles_of_a_box():
     points = around(box(), 300, 0.3)
-    feet = surface(box()).exact(points)
-    distance = np.linalg.norm(points - feet.points, axis=1)
+    closest = surface(box()).exact(points)
+    distance = np.linalg.norm(points - closest.points, axis=1)
     np.testing.assert_allclose(distance, distance_to_every_triangle(box(), points), atol=1e-9)
 
 
 def test_exact_on_small_faces_is_off_by_less_than_a_face():
     points = around(vane(), 60, 0.1)
-    feet = surface(vane()).exact(points)
-    distance = np.linalg.norm(points - feet.points, axis=1)
+    closest = surface(vane()).exact(points)
+    distance = np.linalg.norm(points - closest.points, axis=1)
     true = distance_to_every_triangle(vane(), points)
     assert (distance > true - 1e-9).all()
     assert np.median(distance - true) < 1e-9
@@ -62,13 +62,13 @@ def test_exact_on_small_faces_is_off_by_less_than_a_face():
 
 def test_exact_gives_points_of_the_surface_back():
     points, normals, _ = vane().sample(2000, seed=5)
-    feet = surface(vane()).exact(points)
-    off = np.linalg.norm(feet.points - points, axis=1)
+    closest = surface(vane()).exact(points)
+    off = np.linalg.norm(closest.points - points, axis=1)
     # a face much smaller than the 1 mm between samples has none: its neighbour is found
     assert np.mean(off < 1e-9) > 0.75
     assert off.max() < 1.1
     # and as neighbours are nearly in one plane, the height above the surface is hardly wrong
-    height = np.einsum("ni,ni->n", points - feet.points, feet.normals)
+    height = np.einsum("ni,ni->n", points - closest.points, closest.normals)
     assert np.quantile(np.abs(height), 0.9) < 0.005
     lifted = points + 0.05 * normals
     again = surface(vane()).exact(lifted)
@@ -79,13 +79,13 @@ def test_exact_gives_points_of_the_surface_back():
 def test_samples_are_the_nearest_samples():
     found = surface(vane())
     points = around(vane(), 50, 0.2)
-    feet = found.nearest(points)
-    distance = np.linalg.norm(points - feet.points, axis=1)
+    closest = found.nearest(points)
+    distance = np.linalg.norm(points - closest.points, axis=1)
     every = np.linalg.norm(points[:, None] - found.points, axis=-1)
     np.testing.assert_array_equal(distance, every.min(axis=1))
     index = every.argmin(axis=1)
-    np.testing.assert_array_equal(feet.normals, found.normals[index])
-    np.testing.assert_array_equal(feet.face, found.face[index])
+    np.testing.assert_array_equal(closest.normals, found.normals[index])
+    np.testing.assert_array_equal(closest.face, found.face[index])
 
 
 def test_samples_are_as_close_as_their_spacing_says():
@@ -120,12 +120,12 @@ def test_beyond_the_grid_the_border_answers():
     """Far points come from poses on their way: any sensible sample will do, but it must be one."""
     part, found = vane(), surface(vane())
     far = part.center + 1e4 * np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, -1]])
-    feet = found.coarse(far)
-    assert np.isfinite(feet.points).all()
+    closest = found.coarse(far)
+    assert np.isfinite(closest.points).all()
     side = np.sign(far - part.center)
     axis = np.argmax(np.abs(side), axis=1)
     rows = np.arange(len(far))
-    assert (feet.points[rows, axis] * side[rows, axis] > 0).all()  # on the side that faces them
+    assert (closest.points[rows, axis] * side[rows, axis] > 0).all()  # on the side that faces them
 
 
 def test_the_seed_decides_the_samples():

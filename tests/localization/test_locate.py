@@ -186,8 +186,8 @@ def test_a_symmetric_part_is_ambiguous_and_every_answer_fits():
     poses = [result.part_from_camera, *(a.part_from_camera for a in result.alternatives)]
     for pose in poses:
         moved = pose.apply(points)
-        feet = model(box()).surface.exact(moved).points
-        assert np.quantile(np.linalg.norm(moved - feet, axis=1), 0.98) < 0.4  # four sigma
+        closest = model(box()).surface.exact(moved).points
+        assert np.quantile(np.linalg.norm(moved - closest, axis=1), 0.98) < 0.4  # four sigma
     # they are the four symmetric ones: each the nearest to another
     nearest = set()
     for turn in (np.zeros(3), *(180 * np.eye(3))):

@@ -163,16 +163,18 @@ def test_jacobian_of_rays_against_finite_differences(seed):
     assert clear.mean() > 0.7
 
 
-@pytest.mark.parametrize("feet", ["faces", "samples", "grid"])
-def test_a_ray_that_misses_has_its_distance_to_the_surface(feet):
+@pytest.mark.parametrize("precision", ["faces", "samples", "grid"])
+def test_a_ray_that_misses_has_its_distance_to_the_surface(precision):
     part = box()
     pose = pointing_at(part, [0, 0, 300])
     # 3 mm outside the box's +x side, whose face lies at x = 47 mm
     target = np.array([[50.0, y, z] for y in (-20, -4, 10) for z in (11.0, 16.0, 22.0)])
     points = pose.inverse().apply(target)
-    now = model(part).residuals(batch(pose), points, feet=feet)
+    now = model(part).residuals(batch(pose), points, precision=precision)
     assert not now.hit.any()
-    within = {"faces": 1e-5, "samples": 1.0, "grid": 9.0}[feet]  # cells of 3.3 mm, 2 sqrt(3) / 2
+    within = {"faces": 1e-5, "samples": 1.0, "grid": 9.0}[
+        precision
+    ]  # cells of 3.3 mm, 2 sqrt(3) / 2
     np.testing.assert_allclose(now.deviation_mm[0], 3.0, atol=within)
     assert (now.deviation_mm >= 3 - 1e-5).all()  # no sample is nearer than the surface
     np.testing.assert_allclose(np.linalg.norm(now.jacobian[0, :, 3:], axis=1), 1, atol=1e-12)
@@ -226,7 +228,7 @@ def test_a_ray_that_misses_by_far_has_about_its_distance():
     part = box()
     pose = pointing_at(part, [0, 0, 300])
     points = pose.inverse().apply(np.array([[47 + 30.0, 0, 10], [47 + 60.0, -4, 10]]))
-    now = model(part).residuals(batch(pose), points, feet="faces")
+    now = model(part).residuals(batch(pose), points, precision="faces")
     assert not now.hit.any()
     np.testing.assert_allclose(now.deviation_mm[0], [30, 60], atol=3.0)
 

@@ -13,11 +13,11 @@ from scipy.spatial import cKDTree
 from trimesh.triangles import closest_point
 
 from vanejax.cad.part import Part
-from vanejax.cad.surface import Feet
+from vanejax.cad.surface import ClosestPoints
 
 PAIRS_AT_ONCE = 1 << 17  # of a point and a face
 FIRST_FACES = 8  # of each size, looked at for each point
-TIE_MM = 1e-9  # feet as near as this are one: rounding at 1 m is 1e-13
+TIE_MM = 1e-9  # points as near as this are one: rounding at 1 m is 1e-13
 
 
 class NearestFace:
@@ -45,7 +45,7 @@ class NearestFace:
         self._sizes = [np.flatnonzero(some & (size == v)) for v in np.unique(size[some])]
         self._trees = [cKDTree(middles[faces]) for faces in self._sizes]
 
-    def feet(self, points: np.ndarray) -> Feet:
+    def closest_points(self, points: np.ndarray) -> ClosestPoints:
         """The nearest surface points of points [N, 3] f64, mm, part frame.
 
         Where several faces share one, at an edge or a corner, that which faces the point or turns
@@ -55,15 +55,15 @@ class NearestFace:
             self._some(points[first : first + PAIRS_AT_ONCE // FIRST_FACES])
             for first in range(0, len(points), PAIRS_AT_ONCE // FIRST_FACES)
         ]
-        return Feet(
-            np.concatenate([feet.points for feet in found]),
-            np.concatenate([feet.normals for feet in found]),
-            np.concatenate([feet.face for feet in found]),
+        return ClosestPoints(
+            np.concatenate([closest.points for closest in found]),
+            np.concatenate([closest.normals for closest in found]),
+            np.concatenate([closest.face for closest in found]),
         )
 
-    def _some(self, points: np.ndarray) -> Feet:
+    def _some(self, points: np.ndarray) -> ClosestPoints:
         best = np.full(len(points), np.inf)
-        feet = Feet(
+        closest = ClosestPoints(
             np.zeros((len(points), 3)), np.zeros((len(points), 3)), np.zeros(len(points), np.int64)
         )
         for faces, tree in zip(self._sizes, self._trees, strict=True):
@@ -73,11 +73,11 @@ class NearestFace:
                 ended = []
                 for some in np.array_split(rows, 1 + len(rows) * last // PAIRS_AT_ONCE):
                     middle, order = tree.query(points[some], k=range(first + 1, last + 1))
-                    self._look(points, some, faces[order], middle, best, feet)
+                    self._look(points, some, faces[order], middle, best, closest)
                     ended.append(middle[:, -1] - largest > best[some] + TIE_MM)
                 rows = rows[~np.concatenate(ended)] if last < len(faces) else rows[:0]
                 first, last = last, min(2 * last, len(faces))
-        return feet
+        return closest
 
     def _look(
         self,
@@ -86,7 +86,7 @@ class NearestFace:
         faces: np.ndarray,
         middle: np.ndarray,
         best: np.ndarray,
-        feet: Feet,
+        closest: ClosestPoints,
     ) -> None:
         """Takes the faces [n, k] of the points ``rows``, where one is nearer than the best."""
         row, column = np.nonzero(middle - self._radii[faces] <= best[rows, None] + TIE_MM)
@@ -103,12 +103,14 @@ class NearestFace:
         known = np.unique(point)
         known = known[best[known] <= nearest[known] + TIE_MM]
         point = np.concatenate([point, known])
-        foot = np.concatenate([foot, feet.points[known]])
-        face = np.concatenate([face, feet.face[known]])
-        old = np.abs(np.einsum("ni,ni->n", points[known] - feet.points[known], feet.normals[known]))
+        foot = np.concatenate([foot, closest.points[known]])
+        face = np.concatenate([face, closest.face[known]])
+        old = np.abs(
+            np.einsum("ni,ni->n", points[known] - closest.points[known], closest.normals[known])
+        )
         distance, facing = np.concatenate([distance, best[known]]), np.concatenate([facing, old])
         tied = np.flatnonzero(distance <= nearest[point] + TIE_MM)
         tied = tied[np.argsort(facing[tied], kind="stable")]  # the last one written stays
         which = point[tied]
-        feet.put(which, Feet(foot[tied], self._normals[face[tied]], face[tied]))
+        closest.put(which, ClosestPoints(foot[tied], self._normals[face[tied]], face[tied]))
         best[:] = nearest

@@ -20,7 +20,7 @@ CANDIDATES = 6  # faces tried for an exact foot point
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Feet:
+class ClosestPoints:
     """The nearest surface points of n points.
 
     Attributes:
@@ -33,8 +33,8 @@ class Feet:
     normals: np.ndarray
     face: np.ndarray
 
-    def put(self, which: np.ndarray, better: Feet) -> None:
-        """Takes the feet of the points of the indices ``which`` from ``better``."""
+    def put(self, which: np.ndarray, better: ClosestPoints) -> None:
+        """Takes those of the indices ``which`` from ``better``."""
         self.points[which], self.normals[which] = better.points, better.normals
         self.face[which] = better.face
 
@@ -86,20 +86,20 @@ class Surface:
         occupied = distance_transform_edt(sample < 0, return_distances=False, return_indices=True)
         return low, size, sample[tuple(occupied)]
 
-    def coarse(self, points: np.ndarray) -> Feet:
+    def coarse(self, points: np.ndarray) -> ClosestPoints:
         """The sample nearest to the grid cell of each point [n, 3]: right to about a cell."""
         low, size, nearest = self._grid
         cell = ((points - low) / size).astype(np.int64)
         np.clip(cell, 0, np.array(nearest.shape) - 1, out=cell)
         index = nearest[cell[:, 0], cell[:, 1], cell[:, 2]]
-        return Feet(self.points[index], self.normals[index], self.face[index])
+        return ClosestPoints(self.points[index], self.normals[index], self.face[index])
 
-    def nearest(self, points: np.ndarray) -> Feet:
+    def nearest(self, points: np.ndarray) -> ClosestPoints:
         """The sample nearest to each point [n, 3]: right to about the samples' spacing."""
         _, index = self._tree.query(points)
-        return Feet(self.points[index], self.normals[index], self.face[index])
+        return ClosestPoints(self.points[index], self.normals[index], self.face[index])
 
-    def exact(self, points: np.ndarray) -> Feet:
+    def exact(self, points: np.ndarray) -> ClosestPoints:
         """The foot points on the faces of the nearest few samples, to rounding.
 
         The nearest face of all can be missed where it is smaller than the samples' spacing; the
@@ -108,9 +108,9 @@ class Surface:
         _, index = self._tree.query(points, k=CANDIDATES)
         faces = self.face[index].reshape(-1)
         triangles = self.part.mesh.vertices[self.part.mesh.faces[faces]]
-        feet = closest_point(np.asarray(triangles), np.repeat(points, CANDIDATES, axis=0))
-        feet = feet.reshape(-1, CANDIDATES, 3)
-        best = np.argmin(np.sum((feet - points[:, None]) ** 2, axis=-1), axis=1)
+        closest = closest_point(np.asarray(triangles), np.repeat(points, CANDIDATES, axis=0))
+        closest = closest.reshape(-1, CANDIDATES, 3)
+        best = np.argmin(np.sum((closest - points[:, None]) ** 2, axis=-1), axis=1)
         rows = np.arange(len(points))
         chosen = index[rows, best]
-        return Feet(feet[rows, best], self.normals[chosen], self.face[chosen])
+        return ClosestPoints(closest[rows, best], self.normals[chosen], self.face[chosen])

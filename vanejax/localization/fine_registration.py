@@ -17,6 +17,7 @@ from vanejax.localization.noise import LEAST_COSINE, Noise, fit_noise, weights
 from vanejax.localization.pose_result import Refinement
 from vanejax.localization.residuals import MeasurementModel, Precision, RayCasting, Residuals, moved
 from vanejax.rigid import RigidTransform
+from vanejax.robust_statistics import robust_sigma
 
 COARSE_POINTS = 4_000
 MEDIUM_POINTS = 20_000
@@ -40,7 +41,7 @@ def descend(
     points: np.ndarray,
     *,
     iterations: int,
-    feet: Precision = "grid",
+    precision: Precision = "grid",
     floor_mm: float | None = None,
     settled_deg: float = 0.0,
 ) -> tuple[RigidTransform, int]:
@@ -56,7 +57,7 @@ def descend(
       part_from_camera: H poses, [H, 3, 3] and [H, 3].
       points: [n, 3] mm, camera frame.
       iterations: at most.
-      feet: as in `MeasurementModel.residuals`.
+      precision: as in `MeasurementModel.residuals`.
       floor_mm: the kernel's scale is no smaller; default 1 % of the part's radius.
       settled_deg: a pose that turns by less, and moves by less of the part's radius, is left.
 
@@ -72,9 +73,9 @@ def descend(
     while done < iterations and len(moving):
         done += 1
         poses = RigidTransform(rotation[moving], translation[moving])
-        now = model.residuals(poses, points, feet=feet)
+        now = model.residuals(poses, points, precision=precision)
         deviation = now.deviation_mm
-        scale = 1.4826 * np.median(np.abs(deviation), axis=1)
+        scale = robust_sigma(deviation, axis=1)
         scale = 2 * np.clip(scale, floor, 0.3 * radius)[:, None]
         weight = 1 / (1 + (deviation / scale) ** 2) ** 2
         weighted = now.jacobian * weight[..., None]
@@ -130,7 +131,7 @@ def refine(
         batch,
         coarse,
         iterations=10,
-        feet="samples",
+        precision="samples",
         floor_mm=1e-4 * model.part.radius,
         settled_deg=0.002,
     )

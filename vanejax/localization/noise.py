@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from vanejax.localization.residuals import Residuals
+from vanejax.robust_statistics import robust_sigma
 
 DEGREES_OF_FREEDOM = (1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, np.inf)
 CUTOFF = 5.0  # standard deviations; a normal distribution has 6e-7 beyond
@@ -81,7 +82,7 @@ def _spread(magnitude: np.ndarray, tangent_squared: np.ndarray) -> tuple[float, 
     """range_mm and lateral_mm from robust spreads in bins of equal size over the tangent."""
     order = np.argsort(tangent_squared)
     bins = [b for b in np.array_split(order, 12) if len(b)]
-    variance = np.array([(1.4826 * np.median(magnitude[b])) ** 2 for b in bins]) + LEAST_MM**2
+    variance = np.array([robust_sigma(magnitude[b]) ** 2 for b in bins]) + LEAST_MM**2
     steep = np.array([np.median(tangent_squared[b]) for b in bins])
     if np.ptp(steep) < 1e-6:
         return float(np.sqrt(np.median(variance))), 0.0

@@ -20,6 +20,7 @@ from vanejax.localization.fine_registration import descend, subset
 from vanejax.localization.residuals import MeasurementModel, RayCasting
 from vanejax.localization.verification import View, evidence
 from vanejax.rigid import RigidTransform
+from vanejax.robust_statistics import robust_sigma
 
 STARTS = 400
 START_POINTS = 400
@@ -128,7 +129,7 @@ def search(
     if extra is not None:
         poses = extra if poses is None else concatenate(extra, poses)
     tolerance = 0.03 * model.part.radius
-    now = model.residuals(poses, few, feet="grid")
+    now = model.residuals(poses, few, precision="grid")
     quick = np.clip(1 - (now.deviation_mm / tolerance) ** 2, 0, None)
     quick[now.hit & (now.deviation_mm < -tolerance)] = -0.5
     order = np.argsort(-quick.mean(axis=1), kind="stable")
@@ -153,10 +154,10 @@ def settle(
 
 def noise_level(model: MeasurementModel, poses: RigidTransform, points: np.ndarray) -> np.ndarray:
     """[H] robust standard deviation along the normal of the points near the part, mm."""
-    deviation = np.abs(model.residuals(poses, points, feet="samples").deviation_mm)
+    deviation = np.abs(model.residuals(poses, points, precision="samples").deviation_mm)
     near = np.where(deviation < NEAR * model.part.radius, deviation, np.nan)
     near[:, 0] = np.where(np.isnan(near).all(axis=1), NEAR * model.part.radius, near[:, 0])
-    return 1.4826 * np.nanmedian(near, axis=1)
+    return robust_sigma(near, axis=1, ignore_nan=True)
 
 
 def challengers(surface: Surface, best: RigidTransform) -> RigidTransform:

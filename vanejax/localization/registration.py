@@ -360,7 +360,9 @@ def _alternative(
     model: MeasurementModel, rival: Rival, points: np.ndarray, tolerance_mm: float
 ) -> Alternative:
     """A rival as the result lists it."""
-    deviation = model.residuals(_batch(rival.part_from_camera), points, feet="samples").deviation_mm
+    deviation = model.residuals(
+        _batch(rival.part_from_camera), points, precision="samples"
+    ).deviation_mm
     return Alternative(
         part_from_camera=rival.part_from_camera,
         rotation_deg=rival.rotation_deg,
@@ -376,7 +378,7 @@ def followed(model: MeasurementModel, poses: RigidTransform, points: np.ndarray)
         poses,
         points,
         iterations=8,
-        feet="samples",
+        precision="samples",
         floor_mm=LEAST_TOLERANCE * model.part.radius,
         settled_deg=0.02,
     )[0]

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vanejax.cad.part import Part
-from vanejax.cad.surface import Feet, Surface
+from vanejax.cad.surface import ClosestPoints, Surface
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.virtual_scanner import Scanner
 
@@ -60,9 +60,13 @@ class MeasurementModel(Protocol):
     part: Part
 
     def residuals(
-        self, part_from_camera: RigidTransform, points: np.ndarray, *, feet: Precision = "faces"
+        self,
+        part_from_camera: RigidTransform,
+        points: np.ndarray,
+        *,
+        precision: Precision = "faces",
     ) -> Residuals:
-        """Deviations under a batch of poses; ``feet`` says how well misses are measured."""
+        """Deviations under a batch of poses; ``precision`` says how well misses are measured."""
         ...
 
 
@@ -86,7 +90,11 @@ class RayCasting:
         return self.scanner.part
 
     def residuals(
-        self, part_from_camera: RigidTransform, points: np.ndarray, *, feet: Precision = "faces"
+        self,
+        part_from_camera: RigidTransform,
+        points: np.ndarray,
+        *,
+        precision: Precision = "faces",
     ) -> Residuals:
         """See `MeasurementModel`.
 
@@ -118,7 +126,7 @@ class RayCasting:
             missed = ~hit
             if missed.any():
                 deviation[missed], normals[missed] = _to_surface(
-                    self.surface, turned[missed] + self.part.center, feet
+                    self.surface, turned[missed] + self.part.center, precision
                 )
             out.deviation_mm[block], out.cosine[block], out.hit[block] = deviation, cosine, hit
             _jacobian(turned, normals, out.jacobian[block])
@@ -145,14 +153,18 @@ class SurfaceMatching:
         return self.surface.part
 
     def residuals(
-        self, part_from_camera: RigidTransform, points: np.ndarray, *, feet: Precision = "faces"
+        self,
+        part_from_camera: RigidTransform,
+        points: np.ndarray,
+        *,
+        precision: Precision = "faces",
     ) -> Residuals:
         """See `MeasurementModel`: point to plane, with the plane of the nearest face."""
         moved = part_from_camera.apply(
             np.broadcast_to(points, (*_batch(part_from_camera), *points.shape))
         )
         flat = moved.reshape(-1, 3)
-        found = _feet(self.surface, flat, "grid" if feet == "grid" else "samples")
+        found = _closest_points(self.surface, flat, "grid" if precision == "grid" else "samples")
         offset = flat - found.points
         deviation = np.einsum("ni,ni->n", offset, found.normals)
         distance = np.linalg.norm(offset, axis=-1)
@@ -214,22 +226,22 @@ def _to_surface(
     surface: Surface, points: np.ndarray, precision: Precision
 ) -> tuple[np.ndarray, np.ndarray]:
     """Distance [m] to the surface and the unit direction [m, 3] away from it."""
-    feet = _feet(surface, points, precision)
-    offset = points - feet.points
+    closest = _closest_points(surface, points, precision)
+    offset = points - closest.points
     distance = np.linalg.norm(offset, axis=-1)
     return distance, offset / np.maximum(distance, 1e-12)[:, None]
 
 
-def _feet(surface: Surface, points: np.ndarray, precision: Precision) -> Feet:
-    """Feet of points [m, 3] as near as wanted; of far ones a grid cell's, since they weigh nothing.
+def _closest_points(surface: Surface, points: np.ndarray, precision: Precision) -> ClosestPoints:
+    """Closest points of points [m, 3] to a precision; of far ones a grid cell's: they weigh little.
 
     A search among all samples takes a hundred times longer for a point that is far from them all.
     """
-    feet = surface.coarse(points)
+    closest = surface.coarse(points)
     if precision != "grid":
-        squared = np.sum((points - feet.points) ** 2, axis=1)
+        squared = np.sum((points - closest.points) ** 2, axis=1)
         near = np.flatnonzero(squared < (FAR * surface.part.radius) ** 2)
         search = surface.nearest if precision == "samples" else surface.exact
         if len(near):
-            feet.put(near, search(points[near]))
-    return feet
+            closest.put(near, search(points[near]))
+    return closest

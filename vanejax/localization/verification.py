@@ -141,7 +141,7 @@ def evidence(
     behind the surface; an empty cell where the part should have been measured -0.5 for each point
     that it should hold. ``view`` must be of these very points, or None where no ray is known.
     """
-    now = model.residuals(poses, points, feet="samples")
+    now = model.residuals(poses, points, precision="samples")
     score = _point_scores(now, tolerance_mm, view)
     label = _cubes(points) if view is None else view.patch
     labels = [label]

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
+from vanejax.robust_statistics import robust_sigma
 
 SIDE_MM = 60.0  # the paper's cube
 FORM_MM = 0.02 / np.sqrt(12)  # deviation of a face that is anywhere within its flatness of 0.02 mm
@@ -122,7 +123,7 @@ def fit_face(points: np.ndarray, *, noise_mm: float = 0.0, form_mm: float = 0.0)
         around = points - center
         values, axes = np.linalg.eigh(around.T @ (around * weight[:, None]))
         height = around @ axes[:, 0]
-        before, sigma = weight, max(1.4826 * float(np.median(np.abs(height))), 1e-9)
+        before, sigma = weight, max(float(robust_sigma(height)), 1e-9)
         # Tukey's biweight: strays of a scan lie 20 mm off
         weight = np.maximum(1 - (height / (4.685 * sigma)) ** 2, 0) ** 2
         if len(points) < 20 or np.abs(weight - before).max() < 1e-3:

@@ -121,9 +121,9 @@ def tool_path_deviation(
     if isinstance(surface, Part):
         surface = NearestFace(surface)
     points_part = machine_from_part.inverse().apply(points)
-    feet = surface.feet(points_part)
-    off = points_part - feet.points
-    side = np.where(np.einsum("ni,ni->n", off, feet.normals) < 0, -1.0, 1.0)
+    closest = surface.closest_points(points_part)
+    off = points_part - closest.points
+    side = np.where(np.einsum("ni,ni->n", off, closest.normals) < 0, -1.0, 1.0)
     return PathDeviation(side * np.linalg.norm(off, axis=1), float(tolerance_mm))
 
 

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
+from vanejax.robust_statistics import robust_sigma
 from vanejax.scans.viewpoint import sampled_rows
 from vanejax.scans.voxels import Voxels
 
@@ -183,7 +184,7 @@ def _best_plane(middle: np.ndarray, part: Part, rng: np.random.Generator) -> Pla
         offset = float(normal @ mean)
         height = np.abs(middle @ normal - offset)
         close = height[height <= 2 * plane.thickness_mm]
-        sigma = 1.4826 * float(np.median(close)) if len(close) else 0.0
+        sigma = float(robust_sigma(close)) if len(close) else 0.0
         plane = Plane(normal, offset, _thickness_mm(sigma, part))
     return plane
 
@@ -193,7 +194,7 @@ def _with_thickness(plane: Plane, points: np.ndarray, part: Part) -> Plane:
     height = np.abs(plane.height_mm(points))
     thickness = 2 * PLANE_REACH * part.radius
     for _ in range(3):
-        sigma = 1.4826 * float(np.median(height[height <= 2 * thickness]))
+        sigma = float(robust_sigma(height[height <= 2 * thickness]))
         thickness = _thickness_mm(sigma, part)
     return dataclasses.replace(plane, thickness_mm=thickness)
 

@@ -100,7 +100,7 @@ class TrainedMatcher:
         if max(shift, abs(part.radius - self.radius_mm)) > slack:
             return False
         points = self.reference_points.astype(np.float64)
-        off = np.linalg.norm(NearestFace(part).feet(points).points - points, axis=1)
+        off = np.linalg.norm(NearestFace(part).closest_points(points).points - points, axis=1)
         gaps, _ = cKDTree(points).query(part.sample(len(points), 0)[0])
         # no point of a surface is farther from the point that its voxel keeps than its diagonal
         return bool(off.max() <= slack and gaps.max() <= 2 * self.voxel_mm)

@@ -319,7 +319,7 @@ def pose_bias(
     rng = np.random.default_rng(0)
     points = scan.points[rng.permutation(len(scan.points))[:BIAS_POINTS]]
     batch = RigidTransform(pose.rotation[None], pose.translation[None])
-    now = stand.model.residuals(batch, points, feet="samples")
+    now = stand.model.residuals(batch, points, precision="samples")
     on = now.hit[0] & (np.abs(now.deviation_mm[0]) < FAR_MM) & (now.cosine[0] > LEAST_COSINE)
     columns = now.jacobian[0][on] / now.cosine[0][on, None]
     normals = now.jacobian[0][on, 3:] @ pose.rotation

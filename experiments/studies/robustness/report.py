@@ -9,12 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from experiments.runner.required_accuracy import within_need
 from vanejax.plotting.canvas import FAINT, INK, new_figure, style_chart
 from vanejax.plotting.charts import SERIES
 
 Report = Mapping[str, Any]
 STAGES = ("alone", "refined")
-NEED_DEG, NEED_MM = 0.5, 1.0  # what the paper's process asks for
 METRICS = {"ffmde_abs_mm": "FFMDE (mm)", "rmse_mm": "RMSE (mm)"}
 
 
@@ -28,12 +28,12 @@ def values(step: Report, network: str, stage: str, name: str) -> np.ndarray:
     return np.array([row[network][stage][name] for row in step["rows"]], np.float64)
 
 
-def within_need(step: Report, network: str, stage: str) -> float:
+def share_within_need(step: Report, network: str, stage: str) -> float:
     """Share of a step's scans within the 0.5 deg and 1 mm of the paper's process."""
     turn, shift = (
         values(step, network, stage, name) for name in ("rotation_deg", "translation_mm")
     )
-    return float(np.mean((turn <= NEED_DEG) & (shift <= NEED_MM)))
+    return float(np.mean(within_need(turn, shift)))
 
 
 def steps_of(series: Report) -> Iterator[tuple[str, Report]]:
@@ -59,7 +59,11 @@ def series_lines(report: Report, series: Report) -> Iterator[list[str]]:
                     float(np.median(values(step, network, stage, name)))
                     for name in ("rotation_deg", "translation_mm")
                 )
-                cells += [f"{turn:.3f}", f"{shift:.3f}", f"{within_need(step, network, stage):.0%}"]
+                cells += [
+                    f"{turn:.3f}",
+                    f"{shift:.3f}",
+                    f"{share_within_need(step, network, stage):.0%}",
+                ]
             cells += [f"{np.mean(values(step, network, 'refined', name)):.3f}" for name in METRICS]
             cells += [f"{np.mean([row['truth'][name] for row in rows]):.3f}" for name in METRICS]
             yield cells

@@ -19,6 +19,7 @@ from vanejax.errors import InputError
 from vanejax.localization.fine_registration import refine
 from vanejax.localization.residuals import RayCasting
 from vanejax.rigid import RigidTransform
+from vanejax.robust_statistics import robust_sigma
 
 EDGE_PX = 2.0
 EDGE_JUMP_MM = 4.0
@@ -222,7 +223,7 @@ def _spread(values: np.ndarray) -> float:
     """Robust standard deviation about the median; NaN of fewer than 30."""
     if len(values) < 30:
         return math.nan
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+    return float(robust_sigma(values - np.median(values)))
 
 
 def _share(which: np.ndarray) -> float:

@@ -10,6 +10,7 @@ from experiments.studies.verdicts.challenge_parts import challenge_parts
 from experiments.studies.verdicts.depth_camera import KINDS, measure, random_pose, sensor
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
+from vanejax.robust_statistics import robust_sigma
 from vanejax.scanner.virtual_scanner import Scanner
 
 
@@ -44,7 +45,7 @@ def test_structured_light_is_the_paper_s_camera_with_fewer_pixels(box, scanner, 
     error = points[:, 2] + 230
     # the noise of triangulation, white and correlated, and a bias no larger than some of it
     sigma = np.hypot(1, 0.02 / 0.05) * used.range_sigma_mm(230.0)
-    spread = 1.4826 * np.median(np.abs(error - np.median(error)))  # outliers apart
+    spread = robust_sigma(error - np.median(error))  # outliers apart
     assert 0.8 * sigma < spread < 3 * sigma
     assert abs(np.mean(error)) < 0.05
 

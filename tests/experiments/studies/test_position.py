@@ -104,8 +104,8 @@ def test_the_cube_is_as_flat_and_square_as_it_says():
         assert 0.008 < np.ptp(points[:, k]) < 0.02 * 2  # flatness, and the lean
         # half a triangle of 4 mm in waves of 50 mm and more, 0.01 mm high; a foot in ten is sought
         # on a neighbouring triangle
-        feet = surface.exact(points)
-        assert np.quantile(np.linalg.norm(points - feet.points, axis=1), 0.9) < 1e-3
+        closest = surface.exact(points)
+        assert np.quantile(np.linalg.norm(points - closest.points, axis=1), 0.9) < 1e-3
     lean = block.lean
     for i, j in ((0, 1), (1, 2), (2, 0)):
         assert 60 * abs(lean[:, i] @ lean[:, j]) < 0.02 * 1.01

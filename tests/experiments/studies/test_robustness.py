@@ -98,7 +98,7 @@ def test_random_scans_are_summed_up():
 
 def test_tables_say_medians_shares_and_the_paper(report):
     step = report["series"][0]["steps"][1]
-    assert robustness_report.within_need(step, "ideal", "alone") == 0.5  # 11 deg and 0.2 deg
+    assert robustness_report.share_within_need(step, "ideal", "alone") == 0.5  # 11 deg and 0.2 deg
     text = robustness_report.table(report)
     assert "FFMDE 0.3620, RMSE 0.7904 mm on average" in text
     assert "0 to 350" in text

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from experiments.compare import NEED_DEG, NEED_MM
 from experiments.pages.reproduction.claim import (
     Claim,
     Finding,
@@ -20,9 +19,10 @@ from experiments.pages.reproduction.claim import (
 )
 from experiments.pages.reproduction.live import Live
 from experiments.pages.reproduction.topic import Part, Picture, Topic, origin
+from experiments.runner.required_accuracy import NEED_DEG, NEED_MM
 from experiments.studies.robustness import report as robustness_report
 from experiments.studies.robustness import study as robustness
-from experiments.studies.robustness.report import networks, values, within_need
+from experiments.studies.robustness.report import networks, share_within_need, values
 
 PAPER_SERIES = ("distance", "angle", "light")
 ON_PAGE = 3  # series side by side: more are too small on paper
@@ -52,7 +52,8 @@ def _paper_mean(results: Results, *, series: str, metric: str) -> str:
 def _within_need(results: Results, *, series: str) -> Finding:
     steps, network = _series(results, series)["steps"], networks(results["robustness"])[-1]
     shares, alone = (
-        [within_need(step, network, stage) for step in steps] for stage in ("refined", "alone")
+        [share_within_need(step, network, stage) for step in steps]
+        for stage in ("refined", "alone")
     )
     turn, shift = (
         max(float(values(step, network, "refined", key).max()) for step in steps)
