@@ -17,7 +17,7 @@ from vanejax.localization.noise import LEAST_COSINE, Noise, fit_noise, weights
 from vanejax.localization.pose_result import Refinement
 from vanejax.localization.residuals import MeasurementModel, Precision, RayCasting, Residuals, moved
 from vanejax.rigid import RigidTransform
-from vanejax.robust_statistics import robust_sigma
+from vanejax.scans.robust_statistics import robust_sigma
 
 COARSE_POINTS = 4_000
 MEDIUM_POINTS = 20_000

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from vanejax.localization.residuals import Residuals
-from vanejax.robust_statistics import robust_sigma
+from vanejax.scans.robust_statistics import robust_sigma
 
 DEGREES_OF_FREEDOM = (1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, np.inf)
 CUTOFF = 5.0  # standard deviations; a normal distribution has 6e-7 beyond

@@ -20,7 +20,7 @@ from vanejax.localization.fine_registration import descend, subset
 from vanejax.localization.residuals import MeasurementModel, RayCasting
 from vanejax.localization.verification import View, evidence
 from vanejax.rigid import RigidTransform
-from vanejax.robust_statistics import robust_sigma
+from vanejax.scans.robust_statistics import robust_sigma
 
 STARTS = 400
 START_POINTS = 400

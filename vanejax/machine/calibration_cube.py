@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
-from vanejax.robust_statistics import robust_sigma
+from vanejax.scans.robust_statistics import robust_sigma
 
 SIDE_MM = 60.0  # the paper's cube
 FORM_MM = 0.02 / np.sqrt(12)  # deviation of a face that is anywhere within its flatness of 0.02 mm

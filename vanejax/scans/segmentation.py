@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.robust_statistics import robust_sigma
+from vanejax.scans.robust_statistics import robust_sigma
 from vanejax.scans.viewpoint import sampled_rows
 from vanejax.scans.voxels import Voxels
 

@@ -19,7 +19,7 @@ from vanejax.errors import InputError
 from vanejax.localization.fine_registration import refine
 from vanejax.localization.residuals import RayCasting
 from vanejax.rigid import RigidTransform
-from vanejax.robust_statistics import robust_sigma
+from vanejax.scans.robust_statistics import robust_sigma
 
 EDGE_PX = 2.0
 EDGE_JUMP_MM = 4.0

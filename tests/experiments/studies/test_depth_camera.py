@@ -10,8 +10,8 @@ from experiments.studies.verdicts.challenge_parts import challenge_parts
 from experiments.studies.verdicts.depth_camera import KINDS, measure, random_pose, sensor
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
-from vanejax.robust_statistics import robust_sigma
 from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scans.robust_statistics import robust_sigma
 
 
 @pytest.fixture(scope="module")
