@@ -30,7 +30,8 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "experiments" / "results"
 README, DETAILS = ROOT / "README.md", ROOT / "docs" / "comparison.md"
 ROBUSTNESS, REAL_SCANS = ROOT / "docs" / "robustness.md", ROOT / "docs" / "real_scans.md"
-PAGES = (README, DETAILS, ROBUSTNESS, REAL_SCANS)
+TRAINING = ROOT / "docs" / "training.md"
+PAGES = (README, TRAINING, DETAILS, ROBUSTNESS, REAL_SCANS)
 NAMES = (
     *headline.NEEDS,
     "vane",
@@ -85,43 +86,6 @@ def vane_table(report: Report) -> str:
     return "\n".join(lines)
 
 
-def brief_table(report: Report) -> str:
-    """Table 1 for the README: the paper's figures beside ours, the pose's errors first."""
-    lines = [
-        "| method | paper: RMSE, FFMDE (mm) | FFMDE (mm) | rotation (deg) | translation (mm) | "
-        "within need | refined: rotation (deg) | translation (mm) | within need | time (s) |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for method in report["methods"]:
-        if "skipped" in method:
-            continue
-        alone, refined, paper = method["alone"], method["refined"], method["paper"]
-        published = "" if paper is None else f"{paper['rmse_mm']:.2f}, {paper['ffmde_mm']:.2f}"
-        cells = [
-            method["title"],
-            published,
-            f"{alone['summary']['ffmde_abs_mm']['mean']:.2f}",
-            *_medians(alone),
-            f"{alone['success']:.0%}",
-            *_medians(refined),
-            f"{refined['success']:.0%}",
-            f"{alone['summary']['time_s']['median']:.2g}",
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def _medians(stage: Report) -> list[str]:
-    """Median and p95 of both errors."""
-    errors = (stage["summary"][name] for name in ("rotation_error_deg", "translation_error_mm"))
-    return [f"{_short(error['median'])} ({_short(error['p95'])})" for error in errors]
-
-
-def _short(value: float) -> str:
-    """Two digits, or the whole number."""
-    return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
-
-
 def tuning_table(report: Report) -> str:
     """The best settings of each classical method."""
     lines = [
@@ -162,12 +126,8 @@ def blocks(results: Mapping[str, Report]) -> dict[Path, dict[str, str]]:
         return f"{body(results[name])}\n\n{made_by(results[name])}"
 
     return {
-        README: {
-            "measured": headline.table(results),
-            "vane": vane_table(results["vane"]),
-            "table 1": brief_table(results["comparison"]),
-            "public": public_vs_virtual.table(results["public_vs_virtual"]),
-        },
+        README: {"measured": headline.table(results)},
+        TRAINING: {"vane": vane_table(results["vane"])},
         DETAILS: {
             "table 1": dated("comparison", comparison_table.table),
             "tuning": dated("tuning", tuning_table),

@@ -21,7 +21,15 @@ if TYPE_CHECKING:
     from vanejax.rigid import RigidTransform
     from vanejax.scanner import Camera, Scanner, Sensor, hemisphere_viewpoints, measure, preset
     from vanejax.scans import MeasuredScan, load_scan, save_points
-    from vanejax.training import RpmNetLoss, ScanSet, make_scan_set, make_train_step
+    from vanejax.training import (
+        Drawing,
+        RpmNetLoss,
+        ScanSet,
+        init_state,
+        make_bank,
+        make_scan_set,
+        make_train_step,
+    )
 
 _PLACES = {
     "cad": ("Part", "guide_vane", "load_part"),
@@ -31,7 +39,15 @@ _PLACES = {
     "rigid": ("RigidTransform",),
     "scanner": ("Camera", "Scanner", "Sensor", "hemisphere_viewpoints", "measure", "preset"),
     "scans": ("MeasuredScan", "load_scan", "save_points"),
-    "training": ("RpmNetLoss", "ScanSet", "make_scan_set", "make_train_step"),
+    "training": (
+        "Drawing",
+        "RpmNetLoss",
+        "ScanSet",
+        "init_state",
+        "make_bank",
+        "make_scan_set",
+        "make_train_step",
+    ),
 }
 _PLACE_OF = {name: place for place, names in _PLACES.items() for name in names}
 

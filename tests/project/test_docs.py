@@ -1,11 +1,12 @@
 """The pages: every command is one that its program takes, every link leads somewhere.
 
-What is cheap is run as written (the quick start, all Python of the new pages); of what takes long,
-the program and its own parser are asked. `test_readme` and `test_compensate` run their own pages.
+What is cheap is run as written (the quick start, the Python of `RUN`); of what takes long, the
+program and its own parser are asked. `test_readme` and `test_compensate` run their own pages.
 """
 
 from __future__ import annotations
 
+import argparse
 import ast
 import importlib
 import json
@@ -22,6 +23,7 @@ import pytest
 import test_contract
 import test_verdict
 from absl import flags
+from test_architecture import WINGS
 
 from experiments.pages.reproduction.studies import STUDIES
 from experiments.runner import command_line
@@ -35,7 +37,7 @@ from vanejax.localization.verdict import Rival
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CHANGELOG.md"])
-NEW = ("quick_start", "how_it_works", "conventions", "adding_a_method")
+RUN = ("conventions", "adding_a_method", "virtual_scans")
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 TOOLS = ("cat", "cut", "head", "tail", "ls", "cd", "mkdir")
 FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
@@ -287,11 +289,37 @@ def test_a_dead_link_is_found() -> None:
 
 
 def test_the_index_lists_every_page_and_pages_show_every_picture() -> None:
+    """So does the navigation of the site."""
     listed = links((ROOT / "docs" / "README.md").read_text())
+    navigation = (ROOT / "mkdocs.yml").read_text()
     shown = {Path(link).name for page in PAGES for link in links(page.read_text())}
     files = sorted((ROOT / "docs").iterdir())
     assert [p.name for p in files if p.suffix == ".md" and p.name not in listed] == ["README.md"]
     assert [p.name for p in files if p.suffix in (".png", ".svg") and p.name not in shown] == []
+    assert [p.name for p in files if p.suffix == ".md" and f": {p.name}\n" not in navigation] == []
+    for wing in WINGS[:-1]:  # the command line has a page of its own
+        assert f": api/{wing}.md\n" in navigation
+        assert f"::: vanejax.{wing}\n" in (ROOT / "docs" / "api" / f"{wing}.md").read_text()
+
+
+def test_the_page_of_the_command_line_has_every_option_and_no_other() -> None:
+    page = (ROOT / "docs" / "command_line.md").read_text()
+    sections = dict(
+        re.findall(r"^## vanejax (\w+)\n(.*?)(?=^## |\Z)", page, re.DOTALL | re.MULTILINE)
+    )
+    (choices,) = [a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction)]
+    assert sections.keys() == choices.choices.keys()
+    for name, parser in choices.choices.items():
+        options = {flag for action in parser._actions for flag in action.option_strings}
+        assert set(re.findall(r"`(--[\w-]+)", sections[name])) == options - {"-h", "--help"}, name
+
+
+def test_the_files_that_the_architecture_names_are_there() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    files = re.findall(r"`((?:vanejax|experiments|tests)/[\w/.]+)`", page)
+    assert len(files) > 20
+    assert [name for name in files if not (ROOT / name).exists()] == []
+    assert re.findall(r"^\| `vanejax\.(\w+)` \|", page, re.MULTILINE) == WINGS
 
 
 def test_the_modules_that_pages_name_are_there() -> None:
@@ -403,7 +431,7 @@ def test_every_reason_of_the_verdict_has_its_line() -> None:
     assert left[1] in templates
 
 
-@pytest.mark.parametrize("name", NEW[2:])
+@pytest.mark.parametrize("name", RUN)
 def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     space: dict[str, object] = {"__name__": name}

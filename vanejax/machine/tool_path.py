@@ -184,8 +184,7 @@ def read_tool_path(path: str | os.PathLike[str]) -> ToolPath:
 
     Raises:
       InputError: as `vanejax.scans.point_file.read_points`; or a value that is not finite, or an
-      axis
-        that is not of unit length; names the point.
+        axis that is not of unit length; names the point.
     """
     path = Path(path)
     if path.suffix.lower() not in TEXT_SUFFIXES:

@@ -14,7 +14,6 @@ from experiments.results_page import (
     PAGES,
     RESULTS,
     blocks,
-    brief_table,
     page,
     recorded,
     vane_table,
@@ -29,9 +28,7 @@ def test_the_pages_are_current(path) -> None:
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
 def test_every_picture_of_the_pages_is_there(path) -> None:
-    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", path.read_text())
-    assert pictures
-    for name in pictures:
+    for name in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", path.read_text()):
         assert (path.parent / name).stat().st_size > 10_000
 
 
@@ -42,9 +39,6 @@ def test_the_tables_follow_the_figures() -> None:
     changed["vane"]["summary"]["rotation_error_deg"]["p95"] = 12.34
     assert "12.34" in vane_table(changed["vane"])
     assert "12.34" not in vane_table(results["vane"])
-    figures = changed["comparison"]["methods"][0]["alone"]["summary"]
-    figures["ffmde_abs_mm"]["mean"] = 98.76
-    assert "98.76" in brief_table(changed["comparison"])
     for path, bodies in blocks(results).items():
         text = path.read_text()
         for name in bodies:
@@ -69,10 +63,13 @@ def sentences() -> list[tuple[str, str]]:
         for name in ("consumer_depth", "ideal")
     ]
     return [
-        ("README.md", f"take {effects['all']['ratio']:.1f} times as long as ideal scanning"),
-        ("README.md", f"cores and took {60 * vane['training']['hours']:.0f} minutes"),
         (
-            "README.md",
+            "docs/virtual_scans.md",
+            f"take {effects['all']['ratio']:.1f} times as long as ideal scanning",
+        ),
+        ("docs/training.md", f"cores and took {60 * vane['training']['hours']:.0f} minutes"),
+        (
+            "docs/training.md",
             f"give {_mean(vane, 'rmse_mm'):.2f} and {_mean(vane, 'ffmde_abs_mm'):.2f} mm",
         ),
         ("docs/quick_start.md", f"None of {wrong:,} wrong poses of {parts} parts was accepted"),
