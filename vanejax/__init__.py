@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from vanejax.scanner import Camera, Scanner, Sensor, hemisphere_viewpoints, measure, preset
     from vanejax.scans import MeasuredScan, load_scan, save_points
     from vanejax.training import (
-        Drawing,
+        PairSampling,
         RpmNetLoss,
         ScanSet,
         init_state,
@@ -40,7 +40,7 @@ _PLACES = {
     "scanner": ("Camera", "Scanner", "Sensor", "hemisphere_viewpoints", "measure", "preset"),
     "scans": ("MeasuredScan", "load_scan", "save_points"),
     "training": (
-        "Drawing",
+        "PairSampling",
         "RpmNetLoss",
         "ScanSet",
         "init_state",
