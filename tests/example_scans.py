@@ -14,7 +14,8 @@ from vanejax.cad.surface import Surface
 from vanejax.localization.residuals import RayCasting
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scan, Scanner
+from vanejax.scanner.ideal_scan import Scan
+from vanejax.scanner.virtual_scanner import Scanner
 
 SMALL = Camera(width=160, height=128)  # sees the vane with 2,300 points
 MIDDLE = Camera(width=400, height=320)  # with 14,000

@@ -23,7 +23,8 @@ from vanejax.plotting.canvas import REFERENCE_RED, SOURCE_GREEN
 from vanejax.plotting.clouds import seen_and_hidden
 from vanejax.plotting.shading import crop
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scan, Scanner
+from vanejax.scanner.ideal_scan import Scan
+from vanejax.scanner.virtual_scanner import Scanner
 
 CAMERA = Camera().scaled(0.1)
 HALF_SIZES = np.array([40.0, 30.0, 20.0])

@@ -152,7 +152,7 @@ def test_baselines_do_not_know_each_other():
 
 def test_only_the_scanner_knows_embree():
     users = {n for n, path in modules().items() if any("embree" in i for i in imports(path))}
-    assert users == {"scanner.virtual_scanner"}
+    assert users == {"scanner.embree_scene"}
 
 
 def test_the_rules_can_fail(tmp_path):

@@ -21,7 +21,8 @@ from vanejax.plotting.clouds import seen_and_hidden
 from vanejax.report.view3d import View3d, motion_view, pose_view, scan_view
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scan, Scanner
+from vanejax.scanner.ideal_scan import Scan
+from vanejax.scanner.virtual_scanner import Scanner
 
 PART = guide_vane()
 VIEW = hemisphere_viewpoints(PART.center).view(53)

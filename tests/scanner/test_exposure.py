@@ -63,9 +63,9 @@ def test_nothing_overflows_where_light_grazes():
 def test_noise_grows_with_all_light_and_falls_with_the_modulation():
     light = Exposure(reference_signal=0.4)
     half, same = np.float32([0.2]), np.float32([0.4])
-    np.testing.assert_allclose(light.noise_growth(same, same), 1.0, rtol=1e-6)
-    np.testing.assert_allclose(light.noise_growth(half, half), np.sqrt(2), rtol=1e-6)
-    np.testing.assert_allclose(light.noise_growth(half, same), 2.0, rtol=1e-6)
+    np.testing.assert_allclose(light.noise_gain(same, same), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(light.noise_gain(half, half), np.sqrt(2), rtol=1e-6)
+    np.testing.assert_allclose(light.noise_gain(half, same), 2.0, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from vanejax.errors import InputError
-from vanejax.scanner.range_errors import Lens, Trueness, jumps, mixed_disparity, smooth_field
+from vanejax.scanner.range_errors import (
+    Lens,
+    Trueness,
+    depth_jumps,
+    flying_pixel_errors,
+    smooth_field,
+)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +77,7 @@ def test_jumps_are_those_between_neighbors(seed):
     image = rng.choice([400.0, 401.0, 410.0, np.nan], (9, 7), p=[0.4, 0.2, 0.2, 0.2])
     pixel = np.flatnonzero(np.isfinite(image)).astype(np.int32)
     depth = image.ravel()[pixel].astype(np.float32)
-    a, b = jumps(pixel, depth, width=7, jump_mm=2.0)
+    a, b = depth_jumps(pixel, depth, width=7, jump_mm=2.0)
     places = [tuple(divmod(int(p), 7)) for p in pixel]
     found = [frozenset({places[i], places[j]}) for i, j in zip(a, b, strict=True)]
     assert len(found) == len(set(found))
@@ -79,14 +85,14 @@ def test_jumps_are_those_between_neighbors(seed):
 
 
 def test_no_pixels_have_no_jumps():
-    sides = jumps(np.zeros(0, np.int32), np.zeros(0, np.float32), width=7, jump_mm=1.0)
+    sides = depth_jumps(np.zeros(0, np.int32), np.zeros(0, np.float32), width=7, jump_mm=1.0)
     assert [len(side) for side in sides] == [0, 0]
 
 
 def test_a_mixture_lies_between_both_sides_and_nearer_to_its_own():
     disparity = np.repeat(np.float32([500.0, 480.0]), 2000)
     sides = np.arange(2000), np.arange(2000, 4000)
-    own, added = mixed_disparity(np.random.default_rng(3), sides, disparity, share=0.5)
+    own, added = flying_pixel_errors(np.random.default_rng(3), sides, disparity, rate=0.5)
     assert len(np.unique(own)) == len(own)
     # half of 2,000 edges: standard deviation 22
     assert abs(len(own) - 1000) < 100

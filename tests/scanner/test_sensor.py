@@ -16,7 +16,7 @@ from vanejax.errors import InputError
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints, look_at
 from vanejax.scanner.exposure import Exposure
 from vanejax.scanner.measurement import Measurement, Reason, measure
-from vanejax.scanner.range_errors import Lens, Trueness, rim, windowed
+from vanejax.scanner.range_errors import Lens, Trueness, near_outline, window_mean
 from vanejax.scanner.sensor import PRESETS, Sensor, preset
 from vanejax.scanner.virtual_scanner import Scanner
 
@@ -423,7 +423,7 @@ def test_a_window_is_a_weighted_mean_of_the_pixels_that_see_the_part():
     row, column = np.nonzero(rng.random((17, 23)) < 0.7)
     row, column = row + 100, column + 40
     disparity = rng.uniform(10, 20, len(row)).astype(np.float32)
-    found = windowed(row, column, disparity, window_px=1.5)
+    found = window_mean(row, column, disparity, window_px=1.5)
     for k in range(0, len(row), 7):
         squared = (row - row[k]) ** 2 + (column - column[k]) ** 2
         # scipy cuts the window at 4 standard deviations along each axis
@@ -431,13 +431,13 @@ def test_a_window_is_a_weighted_mean_of_the_pixels_that_see_the_part():
         weight = np.exp(-0.5 * squared / 1.5**2) * near
         np.testing.assert_allclose(found[k], np.sum(weight * disparity) / weight.sum(), rtol=1e-5)
     aside = np.stack([np.full(len(row), 1.0), np.full(len(row), -2.0)])
-    shifted = windowed(row, column, disparity, window_px=1.5, aside_px=aside)
+    shifted = window_mean(row, column, disparity, window_px=1.5, offset_px=aside)
     place = {(r, c): k for k, (r, c) in enumerate(zip(row, column, strict=True))}
     pairs = [(k, place[r + 1, c - 2]) for (r, c), k in place.items() if (r + 1, c - 2) in place]
     assert len(pairs) > 50
     here, there = np.transpose(pairs)
     np.testing.assert_allclose(shifted[here], found[there], rtol=1e-5)
-    assert not len(windowed(row[:0], column[:0], disparity[:0], window_px=1.0))
+    assert not len(window_mean(row[:0], column[:0], disparity[:0], window_px=1.0))
 
 
 def test_a_rim_is_what_lies_near_a_pixel_that_sees_nothing():
@@ -447,9 +447,9 @@ def test_a_rim_is_what_lies_near_a_pixel_that_sees_nothing():
     width = rng.uniform(0, 3, len(row))
     beside = np.argwhere(~np.pad(seen, 1)) - 1
     nearest = np.min(np.hypot(*(np.stack([row, column], -1)[:, None] - beside).T), axis=0)
-    np.testing.assert_array_equal(rim(row + 7, column + 5, width), nearest - 0.5 < width)
-    assert not rim(row, column, np.zeros(len(row))).any()
-    assert not len(rim(row[:0], column[:0], width[:0]))
+    np.testing.assert_array_equal(near_outline(row + 7, column + 5, width), nearest - 0.5 < width)
+    assert not near_outline(row, column, np.zeros(len(row))).any()
+    assert not len(near_outline(row[:0], column[:0], width[:0]))
 
 
 def test_the_outline_is_lost_and_nothing_else(plate):

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from vanejax.cad.part import Part
     from vanejax.scanner.camera import Camera, Viewpoints
-    from vanejax.scanner.virtual_scanner import Scan
+    from vanejax.scanner.ideal_scan import Scan
 
 LABELS = "labels.json"
 FORMATS = ("ply", "npz", "xyz", "pcd")

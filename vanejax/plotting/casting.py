@@ -13,7 +13,8 @@ from vanejax.plotting.canvas import FAINT, INK, new_figure
 from vanejax.plotting.deviation import DEVIATION_COLORMAP
 from vanejax.plotting.shading import crop, draw_part, shade
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scan, Scanner
+from vanejax.scanner.ideal_scan import Scan
+from vanejax.scanner.virtual_scanner import Scanner
 
 # one hue that grows darker: stock has no middle to part from
 STOCK_COLORMAP = "YlGnBu"

@@ -14,7 +14,7 @@ from vanejax.errors import InputError
 from vanejax.plotting.canvas import INK, REFERENCE_RED, SOURCE_GREEN, new_figure
 from vanejax.pointcloud import voxel_thin
 from vanejax.scanner.camera import look_at
-from vanejax.scanner.virtual_scanner import Scan
+from vanejax.scanner.ideal_scan import Scan
 
 # Where the reader stands, as a viewpoint of the hemisphere: oblique enough to see a tilt.
 READER_ELEVATION_DEG = 50.0

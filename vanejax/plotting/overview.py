@@ -21,7 +21,7 @@ from vanejax.plotting.clouds import (
 )
 from vanejax.plotting.shading import crop, draw_part, shade
 from vanejax.scanner.camera import Camera
-from vanejax.scanner.virtual_scanner import Scan
+from vanejax.scanner.ideal_scan import Scan
 
 _HEIGHT_IN, _GAP_IN = 3.4, 0.7
 

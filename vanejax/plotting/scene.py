@@ -21,7 +21,8 @@ from vanejax.plotting.clouds import READER_AZIMUTH_DEG, READER_ELEVATION_DEG
 from vanejax.plotting.shading import shade
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, look_at
-from vanejax.scanner.virtual_scanner import Scan, Scanner
+from vanejax.scanner.ideal_scan import Scan
+from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.measured_scan import MeasuredScan
 
 PART_METAL = "#b4bcc8"

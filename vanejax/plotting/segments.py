@@ -12,7 +12,7 @@ from vanejax.plotting.canvas import INK, REFERENCE_RED, SOURCE_GREEN, new_figure
 from vanejax.plotting.shading import shade
 from vanejax.scanner.camera import Camera
 from vanejax.scanner.clutter import ClutterScene
-from vanejax.scanner.virtual_scanner import Scan
+from vanejax.scanner.ideal_scan import Scan
 from vanejax.scans.segmentation import Segment, Segments
 
 TABLE_SAND = "#d9c9a3"

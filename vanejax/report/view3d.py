@@ -30,7 +30,7 @@ from vanejax.report.templates import source, templates
 from vanejax.report.viewer import MAX_POINTS, scene_json, simplified, spacing_mm
 from vanejax.report.viewer import viewer as viewer_of_result
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.virtual_scanner import Scan
+from vanejax.scanner.ideal_scan import Scan
 from vanejax.scans.measured_scan import MeasuredScan
 
 _HEIGHT_PX = 560

@@ -8,9 +8,11 @@ lost pixel.
 
 from vanejax.scanner.camera import Camera, Viewpoints, hemisphere_viewpoints, look_at
 from vanejax.scanner.clutter import Clutter, clutter_scene
+from vanejax.scanner.ideal_scan import Hits, Scan
 from vanejax.scanner.measurement import Measurement, Reason, measure
 from vanejax.scanner.sensor import Sensor, preset
-from vanejax.scanner.virtual_scanner import Hits, Scan, Scanner, scan_views
+from vanejax.scanner.viewpoint_scans import scan_views
+from vanejax.scanner.virtual_scanner import Scanner
 
 __all__ = [
     "Camera",

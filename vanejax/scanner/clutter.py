@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.scanner.virtual_scanner import Hits, Scanner
+from vanejax.scanner.ideal_scan import Hits
+from vanejax.scanner.virtual_scanner import Scanner
 
 _AROUND = 0.25  # of the part's extent: how far from it chips and drops may fall
 _STRIP_STEPS = 16  # sections along a chip

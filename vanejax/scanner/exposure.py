@@ -105,7 +105,7 @@ class Exposure:
         """[N] f32 brightness that the lamp adds."""
         return np.float32(self.exposure_ms * self.ambient_per_ms) * reflected
 
-    def noise_growth(self, modulation: np.ndarray, total: np.ndarray) -> np.ndarray:
+    def noise_gain(self, modulation: np.ndarray, total: np.ndarray) -> np.ndarray:
         """[N] f32: by what the disparity's noise is larger than at the reference.
 
         The standard deviation of a fringe's phase is that of the brightness over the modulation,

@@ -112,25 +112,25 @@ def _spline(count: int, length_px: float) -> np.ndarray:
     return weight.astype(np.float32)
 
 
-def windowed(
+def window_mean(
     row: np.ndarray,
     column: np.ndarray,
     disparity: np.ndarray,
     *,
     window_px: float,
-    aside_px: np.ndarray | None = None,
+    offset_px: np.ndarray | None = None,
 ) -> np.ndarray:
     """The mean disparity around each pixel [N] f32, among the pixels given.
 
     Stereo compares windows, not pixels: it finds the mean disparity of what a window holds, which
     rounds edges off. More exactly it finds that of the texture in the window, which lies beside the
-    pixel as chance will have it (the adhesion of area-based matching).
+    pixel as chance will have it (edge fattening).
 
     Args:
       row, column: [N] i32, of the pixels that see the part; what lies beside it has no say.
       disparity: [N] f32.
       window_px: standard deviation of the Gaussian window.
-      aside_px: [2, N], how many rows and columns beside its pixel each window's middle lies; none
+      offset_px: [2, N], how many rows and columns beside its pixel each window's middle lies; none
         where the part is no longer there.
     """
     if not len(row):
@@ -143,16 +143,16 @@ def windowed(
         ndimage.gaussian_filter(image, window_px, mode="constant") for image in (total, weight)
     )
     own = total[place] / weight[place]
-    if aside_px is None:
+    if offset_px is None:
         return own
-    middle = np.stack(place) + aside_px
+    middle = np.stack(place) + offset_px
     total, weight = (
         ndimage.map_coordinates(image, middle, order=1, mode="nearest") for image in (total, weight)
     )
     return np.where(weight > 0.25, total / np.maximum(weight, 0.25), own)
 
 
-def rim(row: np.ndarray, column: np.ndarray, width_px: np.ndarray) -> np.ndarray:
+def near_outline(row: np.ndarray, column: np.ndarray, width_px: np.ndarray) -> np.ndarray:
     """[N] bool: whether the centre of a pixel is nearer than ``width_px`` [N] to the outline.
 
     The outline runs between the pixels [N] that see the part and all others.
@@ -165,7 +165,7 @@ def rim(row: np.ndarray, column: np.ndarray, width_px: np.ndarray) -> np.ndarray
     return ndimage.distance_transform_edt(seen)[place] - 0.5 < width_px
 
 
-def jumps(
+def depth_jumps(
     pixel: np.ndarray, depth: np.ndarray, *, width: int, jump_mm: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Neighbouring pixels between which the depth jumps.
@@ -194,12 +194,12 @@ def jumps(
     return np.concatenate([right, below]), np.concatenate([right + 1, lower[below]])
 
 
-def mixed_disparity(
+def flying_pixel_errors(
     rng: np.random.Generator,
     sides: tuple[np.ndarray, np.ndarray],
     disparity: np.ndarray,
     *,
-    share: float,
+    rate: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """What pixels at depth edges measure: some of the surface beside their own.
 
@@ -208,15 +208,15 @@ def mixed_disparity(
 
     Args:
       rng: source of randomness.
-      sides: [J] each, from `jumps`.
+      sides: [J] each, from `depth_jumps`.
       disparity: [N] pixels.
-      share: of the edges, those at which a pixel is mixed.
+      rate: share of the edges, those at which a pixel is mixed.
 
     Returns:
       indices of the mixed pixels [m], no two alike, and what is added to their disparity [m].
     """
     swap, weight, chance = rng.random((3, len(sides[0])), dtype=np.float32)
-    chosen = np.flatnonzero(chance < share)
+    chosen = np.flatnonzero(chance < rate)
     own, other = (np.where(swap < 0.5, *pair)[chosen] for pair in (sides, sides[::-1]))
     own, first = np.unique(own, return_index=True)
     other, weight = other[first], 0.5 * weight[chosen][first]

@@ -3,7 +3,7 @@
 A projector stands beside the camera, ``baseline_mm`` along the camera's +x; what it does not light
 is not measured. The rest is triangulated: errors of the disparity in pixels become errors of the
 depth that grow with its square (`range_errors`), and light that is too much or too little leaves
-holes (`exposure`). Every effect has its own switch; `measurement` applies them.
+holes (`exposure`). Every effect has its own switch; `sensor_effects` has their functions.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class Sensor:
         and new in every scan.
       correlation_px: its length, see `range_errors.smooth_field`.
       window_px: the matching window of a stereo camera, as the standard deviation of a Gaussian: it
-        rounds edges off, see `range_errors.windowed`; 0 for a camera that codes single pixels.
+        rounds edges off, see `range_errors.window_mean`; 0 for a camera that codes single pixels.
       edge_fattening_px: standard deviation, in columns and in rows, of how far beside its pixel the
         texture lies that a window matched; smooth over ``correlation_px``. The error grows with the
         slope of the surface.
       border_dropout_px: mean width of the strip along the part's outline that finds no match; it
-        varies as the correlated error does, see `range_errors.rim`.
+        varies as the correlated error does, see `range_errors.near_outline`.
       flying_pixel_rate: of the places where the depth jumps, those where a pixel mixes both sides.
       jump_mm: what difference of neighbouring depths is a jump.
       disparity_quantisation_px: disparities are rounded to multiples of it; 0 for none.
@@ -86,27 +86,15 @@ class Sensor:
             raise InputError(
                 f"sensor: max_incidence_deg={self.max_incidence_deg!r} must lie in (0, 90]"
             )
-        for name in (
-            "noise_px",
-            "correlated_px",
-            "incidence_spread_deg",
-            "window_px",
-            "edge_fattening_px",
-            "border_dropout_px",
-            "disparity_quantisation_px",
-            "depth_quantisation_mm",
-            "outlier_mm",
-            "jump_mm",
-        ):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"sensor: {name}={getattr(self, name)!r} must be 0 or more")
         if not 1 <= self.correlation_px < math.inf:
             raise InputError(f"sensor: correlation_px={self.correlation_px!r} must be 1 or more")
-        for name in ("flying_pixel_rate", "dropout_rate", "outlier_rate"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(
-                    f"sensor: {name}={getattr(self, name)!r} must be a share from 0 to 1"
-                )
+        for field in dataclasses.fields(self):
+            name, value = field.name, getattr(self, field.name)
+            if name.endswith("_rate") and not 0 <= value <= 1:
+                raise InputError(f"sensor: {name}={value!r} must be a share from 0 to 1")
+            magnitude = name.endswith(("_px", "_mm", "_deg")) and name != "baseline_mm"
+            if magnitude and not 0 <= value < math.inf:
+                raise InputError(f"sensor: {name}={value!r} must be 0 or more")
 
     @property
     def focal_baseline(self) -> float:
@@ -119,23 +107,18 @@ class Sensor:
 
     def scaled(self, factor: float) -> Sensor:
         """The same errors in mm with ``factor`` times the pixels per side."""
-        factors = self.camera.scaled(factor).width / self.camera.width
-        lens = self.lens
-        if lens is not None:
-            columns, rows = lens.center_error_px
-            lens = dataclasses.replace(lens, center_error_px=(columns * factors, rows * factors))
-        return dataclasses.replace(
-            self,
-            camera=self.camera.scaled(factor),
-            noise_px=self.noise_px * factors,
-            correlated_px=self.correlated_px * factors,
-            correlation_px=max(1.0, self.correlation_px * factors),
-            window_px=self.window_px * factors,
-            edge_fattening_px=self.edge_fattening_px * factors,
-            border_dropout_px=self.border_dropout_px * factors,
-            disparity_quantisation_px=self.disparity_quantisation_px * factors,
-            lens=lens,
-        )
+        camera = self.camera.scaled(factor)
+        factor = camera.width / self.camera.width
+        changes = {
+            field.name: factor * getattr(self, field.name)
+            for field in dataclasses.fields(self)
+            if field.name.endswith("_px")
+        }
+        changes["correlation_px"] = max(1.0, changes["correlation_px"])
+        if self.lens is not None:
+            center_error_px = tuple(factor * value for value in self.lens.center_error_px)
+            changes["lens"] = dataclasses.replace(self.lens, center_error_px=center_error_px)
+        return dataclasses.replace(self, camera=camera, **changes)
 
     def exposed_for(self, distance_mm: float) -> Sensor:
         """The same with the exposure that a part at this distance needs.
@@ -166,39 +149,31 @@ class Sensor:
         def normal(value: float) -> float:
             return value * rng.standard_normal()
 
-        exposure, lens, trueness = self.exposure, self.lens, self.trueness
-        if exposure is not None:
-            exposure = dataclasses.replace(
-                exposure,
-                exposure_ms=vary(exposure.exposure_ms),
-                ambient_per_ms=vary(exposure.ambient_per_ms),
+        changes = {}
+        if (light := self.exposure) is not None:
+            changes["exposure"] = dataclasses.replace(
+                light,
+                exposure_ms=vary(light.exposure_ms),
+                ambient_per_ms=vary(light.ambient_per_ms),
                 ambient_towards=(*rng.standard_normal(2), abs(rng.standard_normal()) + 0.3),
-                specular=min(1.0, vary(exposure.specular)),
-                roughness=vary(exposure.roughness),
+                specular=min(1.0, vary(light.specular)),
+                roughness=vary(light.roughness),
             )
-        if lens is not None:
-            lens = Lens(
+        if (lens := self.lens) is not None:
+            changes["lens"] = Lens(
                 *(normal(value) for value in (lens.k1, lens.k2, lens.p1, lens.p2)),
                 focal_error=normal(lens.focal_error),
                 center_error_px=tuple(normal(value) for value in lens.center_error_px),
             )
-        if trueness is not None:
-            trueness = Trueness(
-                scale=normal(trueness.scale),
-                bend_mm=tuple(normal(value) for value in trueness.bend_mm),
+        if (bias := self.trueness) is not None:
+            changes["trueness"] = Trueness(
+                scale=normal(bias.scale), bend_mm=tuple(normal(value) for value in bias.bend_mm)
             )
-        return dataclasses.replace(
-            self,
-            exposure=exposure,
-            lens=lens,
-            trueness=trueness,
-            noise_px=vary(self.noise_px),
-            correlated_px=vary(self.correlated_px),
-            correlation_px=max(1.0, vary(self.correlation_px)),
-            flying_pixel_rate=min(1.0, vary(self.flying_pixel_rate)),
-            dropout_rate=min(1.0, vary(self.dropout_rate)),
-            outlier_rate=min(1.0, vary(self.outlier_rate)),
-        )
+        changes |= {name: vary(getattr(self, name)) for name in ("noise_px", "correlated_px")}
+        changes["correlation_px"] = max(1.0, vary(self.correlation_px))
+        for name in ("flying_pixel_rate", "dropout_rate", "outlier_rate"):
+            changes[name] = min(1.0, vary(getattr(self, name)))
+        return dataclasses.replace(self, **changes)
 
 
 def ideal() -> Sensor:

@@ -1,93 +1,29 @@
-"""The virtual structured-light scanner: Embree rays against the part. Only this file knows embreex.
+"""The virtual structured-light scanner: rays against the part.
 
-What embreex would otherwise do to its callers, and what is done about it here:
-
-* everything is float32: the scene is centred on the part, rays start just in front of it instead
-  of at the camera, and Embree's answer is used for one thing, *which* triangle is hit; the range
-  is then the exact float64 intersection of the pixel's ray with that triangle's plane;
-* a miss is triangle -1 at distance 1e37, normals are not unit vectors, distances are in lengths
-  of the direction vector, and a ``dists`` array is overwritten in place: none of them is read,
-  and the array given is always a fresh one;
-* the scene is built on the first query, which is not safe from two threads: the constructor asks
-  one. After that queries release the GIL, so threads share one scene.
+Embree answers in float32 *which* triangle a ray hits (`embree_scene`); the range is then the exact
+float64 intersection of the pixel's ray with that triangle's plane (`pixel_rays`).
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from collections.abc import Iterator
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
-from tqdm import tqdm
 
 from vanejax.cad.part import Part
+from vanejax.cad.triangles import areas
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera, Viewpoints
+from vanejax.scanner.camera import Camera
+from vanejax.scanner.embree_scene import EmbreeScene
+from vanejax.scanner.ideal_scan import Hits, Scan
 from vanejax.scanner.image_window import PartEnvelope, Window
 from vanejax.scanner.pixel_rays import EDGE_ON_COSINE, MeasuredPixels, PixelRays
 
-T = TypeVar("T")
-
 RAYS_PER_STRIP = 24 * 1024  # what is computed of this many rays stays in the cache
 FACES_AT_ONCE = 1 << 14
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Hits:
-    """Where N rays first meet the part, in the part's frame.
-
-    Attributes:
-      distance_mm: [N] f64, mm from the origin along the unit ray; inf at a miss.
-      face: [N] i32, index of the triangle; -1 at a miss.
-      normals: [N, 3] f64, unit, outward, so facing the ray's origin; zero at a miss.
-    """
-
-    distance_mm: np.ndarray
-    face: np.ndarray
-    normals: np.ndarray
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Scan:
-    """What one view measures, ideally: one point per pixel that sees the part, in pixel order.
-
-    Attributes:
-      points: [N, 3] f32, mm, camera frame.
-      normals: [N, 3] f32, unit, camera frame, of the triangle hit, facing the camera.
-      face: [N] i32, index into the part's triangles.
-      pixel: [N] i32, ``row * camera.width + column``, ascending.
-      camera_from_part: the pose label; numpy f64 [3, 3] and [3], mm.
-      hidden: [H, 3] f32, mm, camera frame: those of the area-uniform surface samples that the view
-        does not see (the red cloud of the paper's Fig. 5); None unless asked for.
-    """
-
-    points: np.ndarray
-    normals: np.ndarray
-    face: np.ndarray
-    pixel: np.ndarray
-    camera_from_part: RigidTransform
-    hidden: np.ndarray | None = None
-
-    @functools.cached_property
-    def range_mm(self) -> np.ndarray:
-        """[N] f32, mm along the ray from the camera: the length of ``points``."""
-        return np.linalg.norm(self.points.astype(np.float64), axis=-1).astype(np.float32)
-
-    @functools.cached_property
-    def incidence_deg(self) -> np.ndarray:
-        """[N] f32, angle between the normal and the way back to the camera, 0 to 90."""
-        points, normals = self.points.astype(np.float64), self.normals.astype(np.float64)
-        # not by acos, which turns float32's rounding of a normal into 0.02 deg at 0 deg
-        sine = np.linalg.norm(np.cross(normals, points), axis=-1)
-        cosine = -np.einsum("ni,ni->n", normals, points)
-        return np.degrees(np.arctan2(sine, cosine)).astype(np.float32)
+LIFT = 3e-5  # of the part's radius: several float32 roundings, to leave a point's own triangle
 
 
 class Scanner:
@@ -109,14 +45,7 @@ class Scanner:
         self._planes = np.empty((len(part.mesh.faces), 4))
         for faces, corners in self._triangles():
             self._planes[faces] = _planes_of(corners)
-        # robust: without it rays slip between two triangles that share an edge
-        self._scene = EmbreeScene(robust=True)
-        TriangleMesh(
-            self._scene,
-            vertices.astype(np.float32),
-            np.ascontiguousarray(part.mesh.faces, np.int32),
-        )
-        self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+        self._scene = EmbreeScene(vertices, part.mesh.faces)
 
     def _triangles(self) -> Iterator[tuple[slice, np.ndarray]]:
         """Faces and their corners [K, 3, 3] f64, mm, about the centre: not all at a time."""
@@ -163,9 +92,8 @@ class Scanner:
         # jump to just before the part's bounding sphere, where float32 is finest
         skip = -np.einsum("...i,...i->...", origins, directions) - 1.01 * self._radius
         starts = origins + np.maximum(skip, 0)[..., None] * directions
-        face = self._scene.run(
-            starts.reshape(-1, 3).astype(np.float32), directions.reshape(-1, 3).astype(np.float32)
-        ).reshape(directions.shape[:-1])
+        face = self._scene.first_face(starts.reshape(-1, 3), directions.reshape(-1, 3))
+        face = face.reshape(directions.shape[:-1])
         planes = self._planes.take(face, axis=0, mode="wrap")  # of any face where none is hit
         normals = np.ascontiguousarray(planes[..., :3])
         closing = np.einsum("...i,...i->...", normals, directions)
@@ -230,7 +158,7 @@ class Scanner:
         once = len(self._planes) <= len(measured.pixel)
         planes = rays.facing(self._planes) if once else self._planes
         for window in windows:
-            face = self._scene.run(*rays.through(window))
+            face = self._scene.first_face(*rays.through(window))
             hit = np.flatnonzero(face >= 0)
             face = face.take(hit)
             plane = planes.take(face, axis=0)
@@ -287,20 +215,15 @@ class Scanner:
         points, normals = points[inside], normals[inside]
         towards = points / points[:, 2:]  # one unit of the ray's parameter is 1 mm of depth
         cosine = np.einsum("ni,ni->n", normals, towards) / np.linalg.norm(towards, axis=-1)
-        # leave the sample's own triangle by several float32 roundings, on the camera's side
-        lift = 3e-5 * self._radius * np.sign(cosine)
-        lifted = points + lift[:, None] * normals
+        lifted = points + (LIFT * self._radius * np.sign(cosine))[:, None] * normals
         local_from_camera = camera_from_local.inverse()
-        starts = local_from_camera.apply(lifted)
-        directions = local_from_camera.rotate(towards)
-        blocker = self._scene.run(
-            starts.astype(np.float32),
-            directions.astype(np.float32),
-            dists=(-lifted[:, 2] - camera.near_mm).astype(np.float32),
-            query="OCCLUDED",
+        blocked = self._scene.is_blocked(
+            local_from_camera.apply(lifted),
+            local_from_camera.rotate(towards),
+            -lifted[:, 2] - camera.near_mm,
         )
         seen = inside
-        seen[inside] = (blocker < 0) & (np.abs(cosine) > EDGE_ON_COSINE)
+        seen[inside] = ~blocked & (np.abs(cosine) > EDGE_ON_COSINE)
         return camera_from_local.apply(points_local[~seen]).astype(np.float32)
 
     def lit(
@@ -325,20 +248,14 @@ class Scanner:
         center = camera_from_part.apply(self._center[None])
         lit = np.einsum("ni,ni->n" if towards.ndim == 2 else "ni,i->n", normals, towards) > 0
         facing = np.flatnonzero(lit)
-        # leave the face by several float32 roundings, on the side of the light
-        lift = np.float32(3e-5 * self._radius)
         starts = points.take(facing, axis=0) - center.astype(np.float32)
-        starts += lift * normals.take(facing, axis=0)
+        starts += np.float32(LIFT * self._radius) * normals.take(facing, axis=0)
         ways = towards.take(facing, axis=0) if towards.ndim == 2 else towards[None]
         turn = rotation.astype(np.float32)
         ways = np.broadcast_to(_turned(ways, turn), starts.shape)
-        blocker = self._scene.run(
-            _turned(starts, turn),
-            np.ascontiguousarray(ways),
-            dists=np.ones(len(facing), np.float32),
-            query="OCCLUDED",
+        lit[facing] = ~self._scene.is_blocked(
+            _turned(starts, turn), np.ascontiguousarray(ways), np.ones(len(facing))
         )
-        lit[facing] = blocker < 0
         return lit
 
     def _refuse_camera_inside(self, camera_from_local: RigidTransform) -> None:
@@ -353,71 +270,18 @@ class Scanner:
         largest, direction = 0.0, np.ones((1, 3))
         for faces, corners in self._triangles():
             middle = corners.mean(axis=1) - eye
-            area = np.linalg.norm(
-                np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
-            )
             distance = np.maximum(np.linalg.norm(middle, axis=-1), 1e-6 * self._radius)
             towards = np.abs(np.einsum("ni,ni->n", self._planes[faces, :3], middle))
-            solid_angle = area * towards / distance**3
+            solid_angle = areas(corners) * towards / distance**3
             face = np.argmax(solid_angle)
             if solid_angle[face] > largest:
                 largest, direction = solid_angle[face], middle[[face]]
-        face = self._scene.run(eye[None].astype(np.float32), direction.astype(np.float32))[0]
+        face = self._scene.first_face(eye[None], direction)[0]
         if face >= 0 and self._planes[face, :3] @ direction[0] > 0:
             raise InputError(
                 f"the camera at {np.round(eye + self._center, 3)} mm (part frame) is inside the "
                 f"part {self.part.name}; move it at least camera.near_mm away"
             )
-
-
-def scan_views(
-    part: Part,
-    camera: Camera,
-    viewpoints: Viewpoints,
-    *,
-    transform: Callable[[Scan], T] = lambda scan: scan,
-    hidden: bool = False,
-    workers: int | None = None,
-    progress: bool = True,
-) -> list[T]:
-    """Scans a part from every viewpoint, on all cores.
-
-    A view of 200,000 points takes 6 MB, so 216 of them do not belong in memory: ``transform`` is
-    applied to each scan in the thread that made it, and only its result is kept.
-
-    Args:
-      part: what is seen.
-      camera: by what.
-      viewpoints: from where; V views.
-      transform: from `Scan` to what is kept of it, such as a thinned cloud; runs in threads.
-      hidden: whether `Scan.hidden` is wanted.
-      workers: number of threads; None for one per core. Does not change the result.
-      progress: whether to show a progress bar.
-
-    Returns:
-      V results in the order of the viewpoints.
-
-    Raises:
-      InputError: a view that does not see the part; the message names the view.
-    """
-    if workers is not None and workers < 1:
-        raise InputError(f"workers must be at least 1, got {workers}")
-    scanner = Scanner(part)
-
-    def one(index: int) -> T:
-        try:
-            scan = scanner.scan(camera, viewpoints.view(index), hidden=hidden)
-        except InputError as error:
-            elevation, azimuth = viewpoints.elevation_deg[index], viewpoints.azimuth_deg[index]
-            where = f"view {index} (elevation {elevation:g} deg, azimuth {azimuth:g} deg)"
-            raise InputError(f"{where}: {error}") from error
-        return transform(scan)
-
-    # an error, or Ctrl-C, leaves the generator of `map`, which cancels the views not yet begun
-    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
-        results = pool.map(one, range(len(viewpoints)))
-        bar = tqdm(results, "scanning", len(viewpoints), unit="view", disable=not progress)
-        return list(bar)
 
 
 def _turned(vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:

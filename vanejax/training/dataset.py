@@ -18,7 +18,8 @@ from vanejax.files import atomic_write, read_stored_arrays
 from vanejax.pointcloud import voxel_thin
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, Viewpoints
-from vanejax.scanner.virtual_scanner import Scan, scan_views
+from vanejax.scanner.ideal_scan import Scan
+from vanejax.scanner.viewpoint_scans import scan_views
 
 FORMAT = "vanejax scan set"
 VERSION = 1
