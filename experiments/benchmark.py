@@ -28,7 +28,7 @@ from experiments.benchmarks.network import inference, step
 from experiments.benchmarks.processes import command, start
 from experiments.benchmarks.registration import refine_against_casts, register_from
 from experiments.benchmarks.scaling import scaling
-from experiments.benchmarks.scaling_series import Series, growth_table, summarize_growth
+from experiments.benchmarks.scaling_series import Series, scaling_table, summarize_scaling
 from experiments.benchmarks.scanning import scan
 from experiments.benchmarks.timing import Bench, Figure, summarize, table
 from experiments.runner import machine
@@ -77,13 +77,13 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
         print(f"{name} ...", file=sys.stderr)
         figures += BENCHMARKS[name](bench)
     rows = summarize([figure for figure in figures if isinstance(figure, Figure)])
-    growth = summarize_growth([series for series in figures if isinstance(series, Series)])
-    report = study.save(settings.out, "benchmark", report | {"rows": rows, "growth": growth})
+    scaling_rows = summarize_scaling([series for series in figures if isinstance(series, Series)])
+    report = study.save(settings.out, "benchmark", report | {"rows": rows, "scaling": scaling_rows})
     print(headline(report))
     if rows:
         print(table(rows))
-    if growth:
-        print(growth_table(growth))
+    if scaling_rows:
+        print(scaling_table(scaling_rows))
     return report
 
 

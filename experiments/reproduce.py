@@ -71,6 +71,11 @@ def docs_page() -> str:
     return to_markdown(document(recorded(), mode))
 
 
+def write_docs() -> None:
+    """Writes docs/results.md."""
+    write_text(PAGE, docs_page())
+
+
 def quick(out: Path, weights: str) -> Reproduction:
     """The page of the recorded results, with the weights evaluated afresh.
 
@@ -129,7 +134,7 @@ def _write(page: Path, report: Document) -> None:
 def main(settings: argparse.Namespace) -> int:
     """The command; its exit code."""
     if settings.docs:
-        write_text(PAGE, docs_page())
+        write_docs()
         print(PAGE)
         return 0
     if settings.quick:

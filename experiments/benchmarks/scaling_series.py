@@ -42,7 +42,7 @@ def exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float | None:
     return float(np.polyfit(x, y, 1)[0])
 
 
-def summarize_growth(series: Sequence[Series]) -> list[dict[str, Any]]:
+def summarize_scaling(series: Sequence[Series]) -> list[dict[str, Any]]:
     """For JSON: each size with its times, and the exponent of the medians."""
     rows = []
     for one in series:
@@ -55,9 +55,9 @@ def summarize_growth(series: Sequence[Series]) -> list[dict[str, Any]]:
     return rows
 
 
-def growth_table(rows: Sequence[dict[str, Any]]) -> str:
+def scaling_table(rows: Sequence[dict[str, Any]]) -> str:
     """The rows as aligned text."""
-    lines = [f"{'growth':<46}{'median (s)':>11}{'min - max':>20}"]
+    lines = [f"{'scaling':<46}{'median (s)':>11}{'min - max':>20}"]
     for row in rows:
         power = "" if row["exponent"] is None else f": grows as size^{row['exponent']:.2f}"
         lines.append(f"{row['name']}{power}")

@@ -175,21 +175,21 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         if row["goal_s"] is not None:
             goal = f"  {row['goal_s']:g}" + (f": {row['met']}" if row["met"] else "")
         lines.append(f"{row['name']:<46}{cells}{goal}".rstrip())
-        lines += [f"    {_comparison(entry)}" for entry in row["against"]]
+        lines += [f"    {comparison(entry)}" for entry in row["against"]]
         if row["note"]:
             lines.append(f"    {row['note']}")
     return "\n".join(lines)
 
 
-def _comparison(entry: Mapping[str, Any]) -> str:
-    """Such as "6.21 times as fast as Open3D; at least 6: met"."""
+def comparison(entry: Mapping[str, Any]) -> str:
+    """Such as "6.21 times as fast as Open3D (at least 6: met)"."""
     if entry["ratio"] is None:
         return f"not compared with {entry['name']}"
-    fast, bound = ("fast", "at least") if entry["kind"] == "peer" else ("long", "at most")
-    words = f"{entry['ratio']:.2f} times as {fast} as {entry['name']}"
+    peer = entry["kind"] == "peer"
+    words = f"{entry['ratio']:.2f} times as {'fast' if peer else 'long'} as {entry['name']}"
     if entry["met"] is None:
         return words
-    return f"{words}; {bound} {entry['goal']:g}: {entry['met']}"
+    return f"{words} ({'at least' if peer else 'at most'} {entry['goal']:g}: {entry['met']})"
 
 
 def shown(seconds: float) -> str:

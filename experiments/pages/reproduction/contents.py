@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 from experiments.pages.reproduction.claim import Claim, Results, Verdict
 from experiments.pages.reproduction.live import Live
-from experiments.pages.reproduction.markdown import table
 from experiments.pages.reproduction.topic import Part, Topic
 from experiments.pages.reproduction.topics.density import DENSITY
 from experiments.pages.reproduction.topics.methods import METHODS
@@ -20,6 +19,7 @@ from experiments.pages.reproduction.topics.sensing import CLUTTER, SENSING
 from experiments.pages.reproduction.topics.speed import SPEED
 from experiments.pages.reproduction.topics.training import ABLATIONS, PUBLIC_SHAPES
 from experiments.pages.reproduction.topics.views import VIEWS
+from experiments.runner.markdown import table
 
 # as their claims are listed
 OF_PAPER = (SCANNER, DENSITY, METHODS, VIEWS, ABLATIONS, PUBLIC_SHAPES, SENSING, POSITION)

@@ -9,10 +9,9 @@ from pathlib import Path
 from experiments.pages.reproduction.claim import Results
 from experiments.pages.reproduction.contents import OF_OURS, OF_PAPER, Section, sections, summary
 from experiments.pages.reproduction.live import Live
-from experiments.pages.reproduction.markdown import table
 from experiments.pages.reproduction.studies import BY_RECORD, Outcome
 from experiments.pages.reproduction.topic import Picture
-from experiments.results_page import measured_on
+from experiments.runner.markdown import machine_of, table
 
 TITLE = "The paper, measured again"
 PAPER = (
@@ -123,7 +122,7 @@ def _provenance(results: Results) -> str:
                 f"`{name}.json`",
                 str(report["date"])[:10],
                 f"`{str(report['commit'] or 'unknown')[:11]}`",
-                measured_on(report),
+                machine_of(report),
                 ", ".join(map(str, seed)) if isinstance(seed, list) else str(seed),
                 f"`{BY_RECORD[name].command()}`",
             ]

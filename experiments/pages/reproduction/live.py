@@ -11,8 +11,8 @@ from typing import Any
 from experiments.configs import vane
 from experiments.evaluate import evaluate
 from experiments.pages.reproduction.claim import digits
-from experiments.pages.reproduction.markdown import table
 from experiments.runner.experiment import Experiment
+from experiments.runner.markdown import table
 from experiments.studies.position import study as position
 from experiments.train import load_or_scan
 from vanejax.errors import InputError

@@ -10,15 +10,12 @@ import html
 import re
 from collections.abc import Callable, Iterator, Sequence
 
+from experiments.runner.markdown import slug
+
 _INLINE = re.compile(r"`([^`]+)`|\*\*(.+?)\*\*|\[([^\]]+)\]\(([^)\s]+)\)")
 _NUMBER = re.compile(r"[+−-]?[\d.,]+ ?%?")
 _SHORT = re.compile(r"`[^` ]{1,30}`|\d{4}-\d\d-\d\d")
 _WIDE = 8  # columns from which a table is set smaller
-
-
-def slug(title: str) -> str:
-    """The anchor that GitHub gives a heading."""
-    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
 
 
 def inline(text: str) -> str:
@@ -132,12 +129,3 @@ def _kind(column: Sequence[str]) -> str:
     if told and all(_SHORT.fullmatch(cell) for cell in told):
         return ' class="k"'
     return ""
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of Markdown."""
-    return "\n".join([_row(head), "|" + "---|" * len(head), *map(_row, rows)])
-
-
-def _row(values: Sequence[str]) -> str:
-    return "| " + " | ".join(value.replace("|", "\\|") for value in values) + " |"

@@ -23,9 +23,10 @@ from experiments.pages.reproduction.document import (
     closing,
     summaries,
 )
-from experiments.pages.reproduction.markdown import slug, to_html
+from experiments.pages.reproduction.markdown import to_html
 from experiments.pages.reproduction.topic import Picture
 from experiments.runner.machine import cores, cpu_model
+from experiments.runner.markdown import slug
 from experiments.runner.run_folder import git_commit
 
 PICTURE_DPI = 110

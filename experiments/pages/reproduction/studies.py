@@ -224,7 +224,7 @@ STUDIES = (
         0.2,
     ),
     _study(
-        "growth",
+        "scaling",
         "how costs grow",
         f"experiments.benchmark --only scaling --weights {_VANE} --out {{folder}}",
         0.2,

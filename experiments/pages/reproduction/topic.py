@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 
 from experiments.pages.reproduction.claim import Claim, Results
 from experiments.pages.reproduction.live import Live
-from experiments.pages.reproduction.markdown import slug
 from experiments.pages.reproduction.studies import BY_RECORD
-from experiments.results_page import made_by, text_block
+from experiments.runner.markdown import provenance, slug, text_block
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -91,4 +90,4 @@ def missing(name: str) -> str:
 
 def origin(results: Results, name: str) -> str:
     """Which record, from where."""
-    return f"Record `{name}.json`: {made_by(results[name])}"
+    return f"Record `{name}.json`: {provenance(results[name])}"

@@ -80,8 +80,8 @@ def test_a_peer_is_to_be_slower_and_a_limit_near() -> None:
     lines = table(rows).splitlines()
     assert max(map(len, lines)) <= 100
     assert lines[1].split() == ["mine", "4.000", "3.000", "-", "5.000", "3:", "missed"]
-    assert lines[2] == "    2.00 times as fast as peer; at least 3: missed"
-    assert "    1.00 times as long as limit; at most 1.5: met" in lines
+    assert lines[2] == "    2.00 times as fast as peer (at least 3: missed)"
+    assert "    1.00 times as long as limit (at most 1.5: met)" in lines
     assert "    not compared with gone" in lines
     assert "    skipped: not here" in lines
 
@@ -274,7 +274,7 @@ def test_an_evaluation_is_told_with_and_without_pictures(bench: Bench, monkeypat
     assert set(figures[1].limits) == {figures[0].name}
 
 
-# ---- growth ----
+# ---- scaling ----
 
 
 def test_a_refined_part_is_the_same_surface() -> None:
@@ -329,7 +329,7 @@ def test_the_refinements_are_compared(tmp_path: Path, monkeypatch, capsys) -> No
     assert "GFLOP/s" in printed
 
 
-def test_growth_has_a_table_of_its_own(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_scaling_has_a_table_of_its_own(tmp_path: Path, monkeypatch, capsys) -> None:
     def quadratic(bench: Bench) -> Iterator[Series]:
         assert bench.large
         yield Series("a thing", "points", [10, 20], [[0.1], [0.4]])
@@ -338,7 +338,7 @@ def test_growth_has_a_table_of_its_own(tmp_path: Path, monkeypatch, capsys) -> N
     arguments = ["--only", "scaling", "--large", "--out", str(tmp_path)]
     report = main(make_parser().parse_args(arguments))
     assert report["rows"] == []
-    assert report["growth"][0]["exponent"] == pytest.approx(2.0)
+    assert report["scaling"][0]["exponent"] == pytest.approx(2.0)
     assert "a thing: grows as size^2.00" in capsys.readouterr().out
 
 

@@ -16,9 +16,9 @@ from experiments.pages.reproduction import studies
 from experiments.pages.reproduction.contents import CLAIMS, GOALS
 from experiments.pages.reproduction.document import document, to_markdown
 from experiments.pages.reproduction.live import Live
-from experiments.pages.reproduction.markdown import slug
 from experiments.pages.reproduction.run import estimate, run_studies
 from experiments.pages.reproduction.studies import STUDIES, Study, recorded
+from experiments.runner.markdown import slug
 from vanejax.errors import InputError
 
 QUICK_FINE = Study(

@@ -149,7 +149,7 @@ def test_what_is_missing_is_said_to_be(results) -> None:
         assert (one.finding({}).verdict is Verdict.UNKNOWN) is bool(one.records), one.says
     text = to_markdown(document({}, ""))
     for study in BY_RECORD.values():
-        if study.record not in ("sensor_effects", "growth", "tuning"):  # told of with others
+        if study.record not in ("sensor_effects", "scaling", "tuning"):  # told of with others
             assert f"there is no result {study.record}." in text, study.name
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 
-from experiments.pages.reproduction.markdown import cells, inline, table, to_html
+from experiments.pages.reproduction.markdown import cells, inline, to_html
+from experiments.runner.markdown import table
 
 
 def test_markdown_becomes_html() -> None:

@@ -45,7 +45,7 @@ def test_the_command_is_the_one_that_made_the_record(study, results) -> None:
     if "out" in config:
         mine = arguments_of(study)
         # files and folders lie elsewhere; what an older record lacks has its default since
-        paths = {"out", "weights", "folder"} | ({"only"} if study.name == "growth" else set())
+        paths = {"out", "weights", "folder"} | ({"only"} if study.name == "scaling" else set())
         for name in set(mine) & set(config) - paths:
             assert mine[name] == config[name], name
         if isinstance(mine.get("weights"), list):

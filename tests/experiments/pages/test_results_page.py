@@ -3,53 +3,125 @@
 from __future__ import annotations
 
 import copy
-import json
 import re
 
 import pytest
 
-from experiments.pages.marked_page import with_block
-from experiments.results_page import (
-    NAMES,
-    PAGES,
-    RESULTS,
-    blocks,
-    page,
-    recorded,
-    vane_table,
-)
+from experiments import performance_page, results_page
+from experiments.pages import blocks, tables
+from experiments.pages.blocks import page, pages
+from experiments.pages.reproduction.studies import RESULTS, recorded
+from experiments.pages.summary_table import summary_table
+from experiments.runner.markdown import with_blocks
+
+PAGES = pages()
+RECORDS = recorded()
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
 def test_the_pages_are_current(path) -> None:
     """If this is red: python -m experiments.results_page"""
-    assert page(path, recorded()) == path.read_text()
-
-
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
-def test_every_picture_of_the_pages_is_there(path) -> None:
-    for name in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", path.read_text()):
+    text = path.read_text()
+    assert page(path, RECORDS) == text
+    for name in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text):
         assert (path.parent / name).stat().st_size > 10_000
 
 
-def test_the_tables_follow_the_figures() -> None:
-    results = recorded()
-    assert set(results) == set(NAMES)
-    changed = copy.deepcopy(results)
-    changed["vane"]["summary"]["rotation_error_deg"]["p95"] = 12.34
-    assert "12.34" in vane_table(changed["vane"])
-    assert "12.34" not in vane_table(results["vane"])
-    for path, bodies in blocks(results).items():
-        text = path.read_text()
-        for name in bodies:
-            assert f"<!-- {name} -->" in text
-            assert f"<!-- end of {name} -->" in text
+def test_the_commands_rewrite_the_pages(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(blocks, "write_text", lambda path, text: written.update({path: text}))
+    monkeypatch.setattr(results_page.reproduce, "write_docs", lambda: written.update(results=""))
+    for main, expected in (
+        (performance_page.main, {performance_page.PAGE}),
+        (results_page.main, {*PAGES, "results"}),
+    ):
+        written = {}
+        main()
+        assert set(written) == expected
+        assert all(text == path.read_text() for path, text in written.items() if text)
+
+
+def changed(record: str, place: tuple, value: float) -> dict:
+    """The records with another value at one place."""
+    results = copy.deepcopy(RECORDS)
+    inner = results[record]
+    for step in place[:-1]:
+        inner = inner[step]
+    assert inner[place[-1]] != value
+    inner[place[-1]] = value
+    return results
+
+
+@pytest.mark.parametrize(
+    ("record", "place", "value", "words"),
+    [
+        ("fine", ("levels", 1, "rotation_deg", "rms"), 0.1234, "0.1234 deg and"),
+        ("fine", ("levels", 1, "translation_mm", "ratio"), 7.77, "and 7.77 times the Cramer-Rao"),
+        ("position", ("cameras", 0, "rotation", "rows", 3, "error_deg"), -9.5, "9.500 largest"),
+        ("any_pose", ("accepted_wrong",), 3, "3 wrong poses accepted; 1.0 s"),
+        ("any_pose", ("right",), 0.5, "100 right"),
+        ("robustness", ("random", "seconds", "median"), 8.25, "accepted; 8.2 s each"),
+        ("real_scans", ("accepted_wrong",), 2, "7 accepted, 2 of them wrong"),
+        ("verdicts", ("verdicts_by_sensor", "clutter", "wrong", "accepted"), 4, "| 4 accepted"),
+    ],
+)
+def test_the_summary_follows_the_records(record, place, value, words) -> None:
+    assert words not in summary_table(RECORDS)
+    assert words in summary_table(changed(record, place, value))
+    assert len(summary_table(RECORDS).splitlines()) <= 2 + 8
+
+
+def test_the_tables_follow_the_records() -> None:
+    results = changed("vane", ("summary", "rotation_error_deg", "p95"), 12.34)
+    assert "12.34" in tables.evaluation_table(results["vane"])
+    assert "12.34" not in tables.evaluation_table(RECORDS["vane"])
+
+
+def time_of(name: str, seconds: float, *, goal_s=None, met=None, against=()) -> dict:
+    spread = {"median": seconds, "min": seconds / 2, "max": 2 * seconds}
+    return {"name": name, "seconds": spread, "repeats": 5, "goal_s": goal_s, "met": met,
+            "against": against, "note": ""}  # fmt: skip
+
+
+def test_times_have_their_peers_limits_and_goals() -> None:
+    against = [
+        {"name": "a peer", "kind": "peer", "ratio": 6.2, "goal": 6, "met": "met"},
+        {"name": "a limit", "kind": "limit", "ratio": 2.0, "goal": None, "met": None},
+        {"name": "another", "kind": "peer", "ratio": None, "goal": 1, "met": None},
+    ]
+    skipped = time_of("a peer", 0.0) | {"seconds": None, "repeats": 0, "note": "skipped: missing"}
+    mine = time_of("a thing", 0.1, goal_s=0.05, met="missed", against=against)
+    report = {
+        "date": "2026-01-02T03:04:05+00:00",
+        "commit": "0123456789abcdef",
+        "machine": {"cpu": "A processor", "cores": 2, "matmul_flops_per_second": 2.04e11},
+        "rows": [time_of("a limit", 0.05), mine, skipped],
+        "scaling": [
+            {
+                "name": "cost",
+                "unit": "points",
+                "exponent": 1.04,
+                "points": [{"size": n, "seconds": {"median": n / 1e4}} for n in (1000, 20000)],
+            }
+        ],
+    }
+    lines = tables.performance_table(report, report).splitlines()
+    assert lines[0] == (
+        "A processor, 2 cores, 204 GFLOP/s in a large f32 product; 2026-01-02, commit 0123456789, "
+        "medians of at least 5 repeats."
+    )
+    assert "| a limit | 0.0500 | 0.0250 to 0.100 |  |  |" in lines
+    assert (
+        "| a thing | 0.100 | 0.0500 to 0.200 | 0.05 s: missed | 6.20 times as fast as a peer "
+        "(at least 6: met); 2.00 times as long as a limit; not compared with another |"
+    ) in lines
+    assert "| a peer |  |  |  | skipped: missing |" in lines
+    assert "| cost | 1,000, 20,000 points | 0.100, 2.000 | 1.04 |" in lines
 
 
 def sentences() -> list[tuple[str, str]]:
     """Page and words: where a sentence that nobody generates names a recorded figure."""
-    results = recorded()
-    effects = json.loads((RESULTS / "sensor_effects.json").read_text())["effects"]
+    results = RECORDS
+    effects = results["sensor_effects"]["effects"]
     fine = next(level for level in results["fine"]["levels"] if level["noise_mm"] == 0.1)
     angle, shift = fine["rotation_deg"], fine["translation_mm"]
     verdicts, vane = results["verdicts"], results["vane"]
@@ -95,13 +167,13 @@ def test_sentences_say_what_the_records_say(page_name: str, words: str) -> None:
 
 
 def test_no_wrong_pose_was_accepted_as_the_pages_say() -> None:
-    verdicts = recorded()["verdicts"]
+    verdicts = RECORDS["verdicts"]
     assert verdicts["accepted_wrong"] == []
     assert not any(count["accepted_wrong"] for count in verdicts["register"].values())
 
 
 def test_every_method_of_the_paper_is_in_the_recorded_table() -> None:
-    methods = {method["title"] for method in recorded()["comparison"]["methods"]}
+    methods = {method["title"] for method in RECORDS["comparison"]["methods"]}
     assert {"ICP", "SAC-IA + ICP", "FGR", "DCP", "PointNetLK", "PCRNet", "RPM-Net"} <= methods
 
 
@@ -112,7 +184,9 @@ def test_results_name_no_folder_of_the_machine_that_made_them() -> None:
 
 def test_a_block_is_replaced_between_its_marks_and_nowhere_else() -> None:
     text = "a\n<!-- one -->\nold\n<!-- end of one -->\nb\n"
-    assert with_block(text, "one", "new\n") == "a\n<!-- one -->\nnew\n<!-- end of one -->\nb\n"
-    for broken in ("a", "<!-- one -->", "<!-- end of one --><!-- one -->"):
+    made = with_blocks(text, {"one": "new\n"}.__getitem__)
+    assert made == "a\n<!-- one -->\nnew\n<!-- end of one -->\nb\n"
+    assert with_blocks("a\n<!-- a remark -->\n", {}.__getitem__) == "a\n<!-- a remark -->\n"
+    for broken in ("<!-- end of one -->", "<!-- end of one -->\n<!-- one -->", text + text[2:20]):
         with pytest.raises(ValueError, match="one"):
-            with_block(broken, "one", "new")
+            with_blocks(broken, {}.__getitem__)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from experiments import results_page
+from experiments.pages.reproduction.studies import recorded
 from experiments.studies.sensor_fit import study as sensor_fit
 from experiments.studies.sensor_fit.sensor_statistics import (
     Compared,
@@ -250,14 +250,14 @@ def test_the_fitted_sensor_is_liker_to_real_scans_than_an_ideal_one():
 
 
 def test_the_preset_is_what_was_fitted():
-    recorded, preset = results_page.recorded()["sensor_fit"]["sensor"], consumer_depth()
+    fitted, preset = recorded()["sensor_fit"]["sensor"], consumer_depth()
     field_of = {recorded_as: field for field, recorded_as in sensor_fit.RECORDED_AS.items()}
-    for name, value in recorded.items():
+    for name, value in fitted.items():
         assert getattr(preset, field_of.get(name, name)) == pytest.approx(value, rel=1e-5), name
 
 
 def test_the_table_follows_the_figures():
-    report = results_page.recorded()["sensor_fit"]
+    report = recorded()["sensor_fit"]
     before = sensor_fit.table(report)
     report["virtual"]["all"]["distance_held_out"] = 12.34
     assert "12.34" in sensor_fit.table(report)

@@ -7,7 +7,7 @@ import re
 from experiments.pages.reproduction.claim import Claim, Finding, Report, Results, met_if
 from experiments.pages.reproduction.live import Live
 from experiments.pages.reproduction.topic import Part, Picture, Topic, origin
-from experiments.results_page import text_block
+from experiments.runner.markdown import text_block
 from experiments.studies.density import report as density_report
 from experiments.studies.density.report import STEADY, TO_TELL
 

@@ -16,7 +16,7 @@ from experiments.pages.reproduction.claim import (
 )
 from experiments.pages.reproduction.live import Live
 from experiments.pages.reproduction.topic import Part, Picture, Topic, dated
-from experiments.results_page import tuning_table
+from experiments.pages.tables import tuning_table
 from experiments.studies.comparison import pictures as comparison_pictures
 from experiments.studies.comparison import table as comparison_table
 from experiments.studies.comparison.methods import TABLE_1

@@ -12,7 +12,7 @@ from experiments.pages.reproduction.claim import (
 )
 from experiments.pages.reproduction.live import Live
 from experiments.pages.reproduction.topic import Part, Picture, Topic, dated_text, origin
-from experiments.results_page import text_block
+from experiments.runner.markdown import text_block
 from experiments.studies.any_pose import study as any_pose
 from experiments.studies.fine import study as fine
 from experiments.studies.verdicts import report as verdict_report

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from experiments import performance_page
+from experiments.pages import tables
 from experiments.pages.reproduction.claim import Claim, Finding, Results, digits, met_by_count
 from experiments.pages.reproduction.live import Live
 from experiments.pages.reproduction.topic import Part, Topic
@@ -23,7 +23,7 @@ def _fast(results: Results) -> Finding:
 
 
 def _speed(results: Results, _: Live | None) -> list[Part]:
-    return [performance_page.figures(*(results[name] for name in performance_page.NAMES))]
+    return [tables.performance_table(results["benchmark"], results["scaling"])]
 
 
 SPEED = Topic(
@@ -37,5 +37,5 @@ SPEED = Topic(
         ),
     ),
     _speed,
-    needs=performance_page.NAMES,
+    needs=("benchmark", "scaling"),
 )

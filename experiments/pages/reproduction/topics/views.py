@@ -5,7 +5,7 @@ from __future__ import annotations
 from experiments.pages.reproduction.claim import VISIBLE, Claim, Finding, Results, digits, met_if
 from experiments.pages.reproduction.live import Live, side_by_side
 from experiments.pages.reproduction.topic import Part, Picture, Topic, dated
-from experiments.results_page import vane_table
+from experiments.pages.tables import evaluation_table
 
 _COMPARED = {
     "rotation_error_deg": "rotation error (deg)",
@@ -34,7 +34,7 @@ def _views(results: Results, live: Live | None) -> list[Part]:
     parts: list[Part] = [
         "RPM-Net alone on views that training never saw, from poses up to 45 deg and half a part "
         "radius away, noise of 0.01 radii on both clouds.",
-        dated(results, "vane", vane_table),
+        dated(results, "vane", evaluation_table),
     ]
     if live is not None:
         parts += ["### Evaluated afresh for this page", _against_record(results, live)]
@@ -62,7 +62,7 @@ def _against_record(results: Results, live: Live) -> str:
         f"{str(live.report['commit'])[:10]})."
     )
     if "vane" not in results:
-        return f"{made}\n\n{vane_table(live.report)}"
+        return f"{made}\n\n{evaluation_table(live.report)}"
     record = results["vane"]
     pairs = {
         f"{label}, {column}": tuple(r["summary"][name][column] for r in (record, live.report))
