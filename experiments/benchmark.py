@@ -108,7 +108,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = study.make_parser("benchmark", __doc__)
     parser.add_argument("--only", help=f"some of {','.join(BENCHMARKS)}")
     parser.add_argument(
-        "--weights", type=Path, help="from `vanejax export`, for the guide vane; or shipped"
+        "--weights", type=Path, help="from `vanejax export`, for the guide vane; or pretrained"
     )
     parser.add_argument("--repeats", type=study.count, default=LEAST_REPEATS)
     parser.add_argument(

@@ -144,7 +144,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = study.make_parser("docs_pictures", __doc__)
     parser.add_argument(
         "--weights",
-        default="shipped",
+        default="pretrained",
         help="an exported network of the guide vane (the one that comes with the package)",
     )
     return parser

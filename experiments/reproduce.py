@@ -4,7 +4,7 @@ python -m experiments.reproduce --quick [--weights FILE] [--out runs/reproduce]
 python -m experiments.reproduce [--real-scans FOLDER] [--shapes PATH] [--only NAME,...] [--plan]
 python -m experiments.reproduce --docs
 
-``--quick`` shows the recorded results of experiments/results and evaluates the shipped weights
+``--quick`` shows the recorded results of experiments/results and evaluates the pretrained weights
 afresh on the 54 test views: minutes. Without it everything is trained and measured again, each
 study in a folder of its own under ``--out``: many hours, ``--plan`` says how many. Give the same
 command again to go on: what ended is not done again. A study that fails is named in the page, the
@@ -28,7 +28,7 @@ from experiments.runner import study_command as study
 from vanejax.cad.parametric_vane import guide_vane
 from vanejax.errors import InputError
 from vanejax.files import check_writable, write_text
-from vanejax.training.pretrained import WORD, find_weights
+from vanejax.training.pretrained import PRETRAINED, find_weights
 
 DOCS = ROOT / "docs"
 PAGE = DOCS / "results.md"
@@ -65,8 +65,8 @@ def docs_page() -> str:
     """docs/results.md as the recorded results make it."""
     mode = (
         "Made by `python -m experiments.reproduce --docs` from the recorded results in "
-        "`experiments/results`; `--quick` makes a page of it, with more pictures and the shipped "
-        "weights evaluated afresh."
+        "`experiments/results`; `--quick` makes a page of it, with more pictures and the "
+        "pretrained weights evaluated afresh."
     )
     return to_markdown(document(recorded(), mode))
 
@@ -84,7 +84,7 @@ def quick(out: Path, weights: str) -> Reproduction:
     """
     page = _page(out)
     matcher = find_weights(weights, guide_vane())
-    words = "those that come with the package" if weights == WORD else Path(weights).name
+    words = "those that come with the package" if weights == PRETRAINED else Path(weights).name
     live = evaluate_live(matcher, words, out)
     live = dataclasses.replace(live, position=measure_position(out))
     results = recorded()
@@ -143,7 +143,7 @@ def main(settings: argparse.Namespace) -> int:
                 raise InputError(f"--{name.replace('_', '-')} has no meaning with --quick")
         quick(settings.out, settings.weights)
         return 0
-    if settings.weights != WORD:
+    if settings.weights != PRETRAINED:
         raise InputError("--weights is for --quick; without it every network is trained")
     inputs: dict[str, Any] = {"shapes": settings.shapes or SOLIDS}
     if settings.real_scans:
@@ -160,7 +160,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = study.make_parser("reproduce", __doc__)
     parser.add_argument("--quick", action="store_true", help="recorded results, minutes")
     parser.add_argument(
-        "--weights", default=WORD, help="evaluated by --quick; those of the package (shipped)"
+        "--weights", default=PRETRAINED, help="evaluated by --quick; default: pretrained"
     )
     parser.add_argument("--real-scans", metavar="FOLDER", help="as experiments.real_scans")
     parser.add_argument(

@@ -1,20 +1,27 @@
-"""Files written whole or not at all, and NumPy's files read without trust."""
+"""Files written atomically, and files of arrays (.npz, safetensors) read without trust."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import math
 import os
 import tokenize
 import zipfile
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+import safetensors.numpy
 
 from vanejax.errors import InputError
+
+_MAX_HEADER_BYTES = 1 << 22  # of safetensors: names, shapes and metadata
+_MAX_ARRAYS = 10_000
+_MAX_INFLATION = 8  # numbers hardly compress: what unpacks to more is no file of measurements
 
 
 @contextlib.contextmanager
@@ -103,37 +110,110 @@ def array_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
         raise ValueError("an array without a header") from error
 
 
-def read_stored_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Every array of an .npz file as `numpy.savez` writes it, by name.
+def write_arrays(
+    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]
+) -> None:
+    """Writes arrays and a header by `atomic_write`, with a checksum of the arrays.
+
+    The suffix decides: .npz has the header as JSON in an array ``header``, any other file is
+    safetensors with each value of the header as JSON in its metadata.
 
     Raises:
-      ValueError: damaged, compressed, or an array does not hold what its header announces; the
-        message says what, not which file.
+      InputError: as `atomic_write`.
+    """
+    arrays = {name: np.asarray(value, order="C") for name, value in arrays.items()}
+    header = {**header, "sha256": arrays_sha256(arrays)}
+    with atomic_write(path) as partial, open(partial, "wb") as file:
+        if Path(path).suffix.lower() == ".npz":
+            text = json.dumps(header, sort_keys=True).encode()
+            np.savez(file, header=np.frombuffer(text, np.uint8), **arrays)
+        else:
+            metadata = {name: json.dumps(value, sort_keys=True) for name, value in header.items()}
+            file.write(safetensors.numpy.save(arrays, metadata))
+
+
+def read_arrays(
+    path: str | os.PathLike[str],
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays by name, and the header, of an .npz or safetensors file; its contents say which.
+
+    Nothing is unpickled, and no size in the file is trusted. A header that is not there, or that
+    is no JSON object, is empty. The checksum is compared where vanejax wrote one.
+
+    Raises:
+      ValueError: damaged, neither of the two, or an array does not hold what its header announces;
+        the message says what, not which file.
       OSError: the file cannot be read.
     """
+    path = Path(path)
+    with open(path, "rb") as file:
+        head = file.read(8)
+    arrays, header = _read_npz(path) if head[:2] == b"PK" else _read_safetensors(path, head)
+    ours = str(header.get("format")).startswith("vanejax ")
+    if ours and header.get("sha256", "") not in ("", arrays_sha256(arrays)):
+        raise ValueError("its checksum is wrong")
+    return arrays, header
+
+
+def arrays_sha256(arrays: Mapping[str, np.ndarray]) -> str:
+    """A digest of names, dtypes, shapes and contents of arrays."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        value = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {value.dtype.str} {value.shape}".encode())
+        digest.update(value.data if value.size else b"")
+    return digest.hexdigest()
+
+
+def _read_safetensors(path: Path, head: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    if len(head) < 8 or int.from_bytes(head, "little") > _MAX_HEADER_BYTES:
+        raise ValueError("neither an .npz nor a safetensors file")
+    try:
+        # shapes, offsets and the file's size are compared when it is opened
+        with safetensors.safe_open(path, framework="numpy") as file:
+            names = file.keys()
+            if len(names) > _MAX_ARRAYS:
+                raise ValueError(f"holds {len(names)} arrays, more than {_MAX_ARRAYS}")
+            arrays = {name: file.get_tensor(name) for name in names}
+            metadata = file.metadata() or {}
+    except (safetensors.SafetensorError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(str(error)) from error
+    return arrays, {name: _json_or(text, text) for name, text in metadata.items()}
+
+
+def _read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
             names = [entry.filename.removesuffix(".npy") for entry in entries]
-            if len(set(names)) != len(names):
-                raise ValueError("holds an array twice")
-            # stored entries that are not twice there are no larger together than the file
-            if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-                raise ValueError("holds compressed arrays")
-            if sum(entry.file_size for entry in entries) > path.stat().st_size:
-                raise ValueError("announces more bytes than it has")
-            return {
+            if len(set(names)) != len(names) or len(names) > _MAX_ARRAYS:
+                raise ValueError(f"holds an array twice, or more than {_MAX_ARRAYS}")
+            # no entry unpacks to more than it announces
+            size = sum(entry.file_size for entry in entries)
+            if size > _MAX_INFLATION * path.stat().st_size + (1 << 16):
+                raise ValueError(f"would unpack to {size} bytes, far more than it has")
+            arrays = {
                 name: _read_array(archive, entry)
                 for name, entry in zip(names, entries, strict=True)
             }
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise ValueError(str(error)) from error
+    text = arrays.pop("header", np.empty(0, np.uint8)).tobytes()
+    header = _json_or(text, {})
+    return arrays, header if isinstance(header, dict) else {}
 
 
 def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
     with archive.open(entry) as file:
         shape, fortran, dtype = array_header(file)
         data = file.read()
-    if dtype.hasobject or fortran or len(data) != math.prod(shape) * dtype.itemsize:
+    if dtype.hasobject or len(data) != math.prod(shape) * dtype.itemsize:
         raise ValueError(f"{entry.filename} does not hold the array that it announces")
-    return np.frombuffer(data, dtype).reshape(shape)
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def _json_or(text: str | bytes, default: Any) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return default

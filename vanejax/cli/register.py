@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--weights",
         metavar="FILE",
-        help="a matcher trained for this part, from `vanejax export`, or shipped: the one that "
+        help="a matcher trained for this part, from `vanejax export`, or pretrained: the one that "
         "comes with the package, for the built-in vane; works without",
     )
     parser.add_argument(

@@ -97,8 +97,8 @@ def register(
         fewer wrong poses can be told from right ones. Of no use with a `MeasuredScan`, which has
         its own.
       init: rough part_from_camera. Poses far from it that fit as well are then no ambiguity.
-      weights: what `vanejax export` wrote for this part, or its path; "shipped" for those that come
-        with the package, which know the built-in guide vane.
+      weights: what `vanejax export` wrote for this part, or its path; "pretrained" for those
+        that come with the package, for the built-in guide vane.
       limits: of the verdict.
       segment: whether table, clamps and chips are taken out of the scan first, see
         `vanejax.scans.segmentation`: "off", "on", or "auto", which does so where the scan is not

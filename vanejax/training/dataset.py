@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.files import atomic_write, read_stored_arrays
+from vanejax.files import read_arrays, write_arrays
 from vanejax.pointcloud import voxel_thin
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, Viewpoints
@@ -80,17 +79,13 @@ class ScanSet:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes an .npz with a checksum; it appears complete or not at all."""
-        arrays = self._arrays()
         header = {
             "format": FORMAT,
             "version": VERSION,
             "radius_mm": self.radius_mm,
             "source": dict(self.source),
-            "sha256": _digest(arrays),
         }
-        text = np.frombuffer(json.dumps(header, sort_keys=True).encode(), np.uint8)
-        with atomic_write(path) as partial, open(partial, "wb") as file:
-            np.savez(file, header=text, **arrays)
+        write_arrays(path, self._arrays(), header)
 
     def _arrays(self) -> dict[str, np.ndarray]:
         poses = self.viewpoints.camera_from_part
@@ -189,16 +184,14 @@ def load_scan_set(
     """
     path = Path(path)
     try:
-        arrays = read_stored_arrays(path)
+        arrays, header = read_arrays(path)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: truncated or not a scan set ({error}); delete it and scan again"
         ) from error
-    header = _read_header(arrays.pop("header", None), path)
-    if header["sha256"] != _digest(arrays):
-        raise InputError(f"{path}: its checksum is wrong; delete it and scan again")
+    _check_header(header, path)
     for key, value in (expected or {}).items():
         if header["source"].get(key) != value:
             raise InputError(
@@ -208,20 +201,15 @@ def load_scan_set(
     return _from_arrays(arrays, header, path)
 
 
-def _read_header(raw: np.ndarray | None, path: Path) -> dict[str, Any]:
-    try:
-        header = json.loads(bytes(raw)) if raw is not None else None
-    except ValueError:
-        header = None
+def _check_header(header: Mapping[str, Any], path: Path) -> None:
     wanted = {"format", "version", "radius_mm", "source", "sha256"}
-    if not isinstance(header, dict) or not wanted <= set(header) or header["format"] != FORMAT:
+    if not wanted <= set(header) or header["format"] != FORMAT:
         raise InputError(f"{path}: not a scan set of vanejax")
     if header["version"] != VERSION:
         raise InputError(
             f"{path}: scan set version {header['version']}, this program reads {VERSION}; "
             "delete it and scan again"
         )
-    return header
 
 
 def _from_arrays(arrays: dict[str, np.ndarray], header: dict[str, Any], path: Path) -> ScanSet:
@@ -257,12 +245,3 @@ def _from_arrays(arrays: dict[str, np.ndarray], header: dict[str, Any], path: Pa
     if not consistent:
         raise InputError(f"{path}: the shapes of its arrays do not fit together")
     return scans
-
-
-def _digest(arrays: Mapping[str, np.ndarray]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        value = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name} {value.dtype.str} {value.shape}".encode())
-        digest.update(value.data if value.size else b"")
-    return digest.hexdigest()

@@ -9,34 +9,36 @@ from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.training.weight_file import TrainedMatcher, load_model
 
-WORD = "shipped"  # in place of a file's name
-FILES = ("guide_vane.npz",)
+PRETRAINED = "pretrained"  # in place of a file's name
+_WORDS = (PRETRAINED, "shipped")  # the second is the word of older versions
+_FILES = ("guide_vane.safetensors",)
 
 
-def shipped_weights(part: Part) -> TrainedMatcher | None:
+def pretrained_matcher(part: Part) -> TrainedMatcher | None:
     """The matcher that comes with the package for this part; None if there is none."""
-    for name in FILES:
-        with resources.as_file(resources.files("vanejax") / "weights" / name) as path:
+    folder = resources.files("vanejax.training") / "pretrained_weights"
+    for name in _FILES:
+        with resources.as_file(folder / name) as path:
             matcher = load_model(path)
         if matcher.knows(part):
             return matcher
     return None
 
 
-def find_weights(named: str | os.PathLike[str], part: Part) -> TrainedMatcher:
-    """The matcher of a file, or the shipped one where ``named`` is "shipped".
+def find_weights(name: str | os.PathLike[str], part: Part) -> TrainedMatcher:
+    """The matcher of a file, or the pretrained one where ``name`` is "pretrained" ("shipped").
 
     Raises:
-      InputError: the file cannot be read, or no network of this part is there.
+      InputError: the file cannot be read, or there is no network for this part.
     """
-    if os.fspath(named) != WORD:
-        matcher = load_model(named)
+    if os.fspath(name) not in _WORDS:
+        matcher = load_model(name)
         matcher.check_part(part)
         return matcher
-    found = shipped_weights(part)
-    if found is None:
+    pretrained = pretrained_matcher(part)
+    if pretrained is None:
         raise InputError(
-            f"no weights are shipped for {part.name}, only for the built-in guide vane (vane); "
-            "train for it and export, or leave the weights out: registration works without"
+            f"there are no pretrained weights for {part.name}, only for the built-in guide vane "
+            "(vane); train for it and export, or leave the weights out: registration works without"
         )
-    return found
+    return pretrained

@@ -30,7 +30,7 @@ class TrainState:
     Attributes:
       step: [] i32, steps done.
       variables: the model's, as the optimizer moves them.
-      average: exponential moving average of ``variables``: what is evaluated and shipped.
+      average: exponential moving average of ``variables``: what is evaluated and exported.
       opt_state: the optimizer's.
     """
 

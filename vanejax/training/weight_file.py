@@ -1,7 +1,7 @@
 """A trained matcher in one self-contained file: weights, settings, and the part it knows.
 
-The file is an .npz of plain arrays: ``header`` (JSON as bytes), the thinned surface of the part,
-and the weights under their paths in the network. Nothing is unpickled, no size in it is trusted.
+The file is safetensors, or .npz by that suffix: the weights under their paths in the network, the
+thinned surface of the part, and a header (JSON): settings, the part's hash, figures of the run.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from vanejax.cad.nearest_face import NearestFace
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.files import atomic_write, read_stored_arrays
+from vanejax.files import read_arrays, write_arrays
 from vanejax.matching.rpmnet import RpmNet
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
@@ -143,12 +143,10 @@ def save_model(path: str | os.PathLike[str], matcher: TrainedMatcher) -> None:
         "camera": matcher.camera.to_dict(),
         "trained": dict(matcher.trained),
     }
-    text = json.dumps(header, sort_keys=True).encode()
     arrays = weights_by_name(matcher.variables)
     arrays |= {name: np.asarray(getattr(matcher, name)) for name in _REFERENCE}
-    _matcher(json.loads(text), arrays, path)
-    with atomic_write(path) as partial, open(partial, "wb") as file:
-        np.savez(file, header=np.frombuffer(text, np.uint8), **arrays)
+    _matcher(json.loads(json.dumps(header)), arrays, path)
+    write_arrays(path, arrays, header)
 
 
 def load_model(path: str | os.PathLike[str]) -> TrainedMatcher:
@@ -161,24 +159,25 @@ def load_model(path: str | os.PathLike[str]) -> TrainedMatcher:
     path = Path(path)
     if path.exists() and not path.is_file():
         raise InputError(
-            f"{path}: is a folder or a device; a work folder becomes weights by export"
+            f"{path}: is a folder or a device; `vanejax export` makes weights of a work folder"
         )
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: is too large for weights of vanejax")
-        arrays = read_stored_arrays(path)
+        arrays, header = read_arrays(path)
     except FileNotFoundError:
         raise InputError(
             f"{path}: no such file (looked in {path.parent.absolute()}); "
             "`vanejax export WORKDIR` makes one"
         ) from None
+    except InputError:
+        raise
     except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(
             f"{path}: truncated or no weights of vanejax ({error}); export them again"
         ) from error
-    return _matcher(_read_header(arrays.pop("header", None), path), arrays, path)
+    _check_header(header, path)
+    return _matcher(header, arrays, path)
 
 
 def weights_by_name(variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -294,12 +293,8 @@ def _variables(model: RpmNet, arrays: Mapping[str, np.ndarray], where: str) -> A
     return jax.tree.unflatten(jax.tree.structure(abstract), [arrays[name] for name in wanted])
 
 
-def _read_header(raw: np.ndarray | None, path: Path) -> dict[str, Any]:
-    try:
-        header = json.loads(raw.tobytes()) if raw is not None else None
-    except (ValueError, RecursionError):
-        header = None
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
+def _check_header(header: Mapping[str, Any], path: Path) -> None:
+    if header.get("format") != FORMAT:
         raise InputError(f"{path}: no weights of vanejax; `vanejax export WORKDIR` makes them")
     if header.get("version") != VERSION:
         raise InputError(
@@ -309,7 +304,6 @@ def _read_header(raw: np.ndarray | None, path: Path) -> dict[str, Any]:
     wanted = {"model", "iterations", "drawing", "voxel_mm", "part", "camera", "trained"}
     if missing := sorted(wanted - set(header)):
         raise InputError(f"{path}: its header has no {', '.join(missing)}")
-    return header
 
 
 def _fields(values: Any, limits: Mapping[str, tuple], where: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What the report measures afresh, the shipped network and the stand, held against the record."""
+"""Measured afresh, against the record: the pretrained network and the stand."""
 
 from __future__ import annotations
 

@@ -152,7 +152,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--weights",
         default="none",
-        help="from `vanejax export`, for the guide vane; shipped; none (default)",
+        help="from `vanejax export`, for the guide vane; pretrained; none (default)",
     )
     parser.add_argument("--count", type=study.count, default=200, help="random rotations (200)")
     parser.add_argument("--noise-mm", type=float, default=0.1, help="along the rays (0.1)")

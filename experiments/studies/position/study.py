@@ -357,6 +357,6 @@ def make_parser() -> argparse.ArgumentParser:
         help="of the stage, turned and moved, the initial one included (12, which is the most)",
     )
     parser.add_argument(
-        "--weights", metavar="FILE", help="of RPM-Net, from `vanejax export`; or shipped (none)"
+        "--weights", metavar="FILE", help="of RPM-Net, from `vanejax export`; or pretrained (none)"
     )
     return parser

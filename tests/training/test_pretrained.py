@@ -21,7 +21,7 @@ from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
 from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.measured_scan import MeasuredScan
-from vanejax.training.pretrained import find_weights, shipped_weights
+from vanejax.training.pretrained import find_weights, pretrained_matcher
 from vanejax.training.weight_file import TrainedMatcher
 
 
@@ -32,7 +32,7 @@ def part() -> Part:
 
 @pytest.fixture(scope="module")
 def matcher(part: Part) -> TrainedMatcher:
-    found = shipped_weights(part)
+    found = pretrained_matcher(part)
     assert found is not None
     return found
 
@@ -83,9 +83,9 @@ def test_it_knows_no_other_part(matcher: TrainedMatcher, part: Part, change: str
         assert (other.center == part.center).all()
         assert other.radius == part.radius
     assert not matcher.knows(other)
-    assert shipped_weights(other) is None
-    with pytest.raises(InputError, match=f"no weights are shipped for {change}"):
-        find_weights("shipped", other)
+    assert pretrained_matcher(other) is None
+    with pytest.raises(InputError, match=f"no pretrained weights for {change}"):
+        find_weights("pretrained", other)
 
 
 def test_the_network_alone_comes_near_and_the_product_to_the_pose(
@@ -104,7 +104,7 @@ def test_the_network_alone_comes_near_and_the_product_to_the_pose(
     found = match_poses(matcher, measured, guess, iterations=matcher.iterations)
     cosine = (np.trace(found.rotation[0].T @ truth.rotation) - 1) / 2
     assert np.degrees(np.arccos(cosine)) < 2.0  # 1.2 at most on its test views
-    result = register(measured, part, init=rough, weights="shipped")
+    result = register(measured, part, init=rough, weights="pretrained")
     assert result.verdict.status == "accepted"
     np.testing.assert_allclose(result.part_from_camera.as_matrix(), truth.as_matrix(), atol=5e-3)
 
@@ -120,10 +120,10 @@ def test_the_command_takes_them_by_name(part: Part, tmp_path: Path, capsys, monk
     monkeypatch.setenv("VANEJAX_CACHE_DIR", "off")
     assert main(["scan", "vane", "--out", "scans", "--views", "7,", "--resolution", "0.25"]) == 0
     scan = "scans/view_007.ply"
-    command = ["register", scan, "vane", "--weights", "shipped", "--json", "pose.json"]
+    command = ["register", scan, "vane", "--weights", "pretrained", "--json", "pose.json"]
     assert main([*command, "--quiet"]) == 0
-    assert json.loads(Path("pose.json").read_text())["weights"] == "shipped"
+    assert json.loads(Path("pose.json").read_text())["weights"] == "pretrained"
     box = part_of(part.mesh.convex_hull, "box")
     box.export("box.stl")
-    assert main(["register", scan, "box.stl", "--weights", "shipped"]) == 2
-    assert "no weights are shipped for box" in capsys.readouterr().err
+    assert main(["register", scan, "box.stl", "--weights", "pretrained"]) == 2
+    assert "no pretrained weights for box" in capsys.readouterr().err
