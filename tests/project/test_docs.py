@@ -23,7 +23,7 @@ import pytest
 import test_contract
 import test_verdict
 from absl import flags
-from test_architecture import WINGS
+from test_architecture import GROUND, WINGS
 
 from experiments.pages.reproduction.studies import STUDIES
 from experiments.runner import command_line
@@ -298,6 +298,8 @@ def test_the_index_lists_every_page_and_pages_show_every_picture() -> None:
     assert [p.name for p in files if p.suffix == ".md" and p.name not in listed] == ["README.md"]
     assert [p.name for p in files if p.suffix in (".png", ".svg") and p.name not in shown] == []
     assert [p.name for p in files if p.suffix == ".md" and f": {p.name}\n" not in navigation] == []
+    overview = (ROOT / "docs" / "api" / "index.md").read_text()
+    assert re.findall(r"::: vanejax\.(\w+)\n", overview) == sorted(GROUND)
     for wing in WINGS[:-1]:  # the command line has a page of its own
         assert f": api/{wing}.md\n" in navigation
         assert f"::: vanejax.{wing}\n" in (ROOT / "docs" / "api" / f"{wing}.md").read_text()
