@@ -1,10 +1,8 @@
 """The virtual camera, its viewpoints on the hemisphere, and their pose labels.
 
-Conventions, stated once. Camera frame: origin at the camera, x right, y up, +z from the part to
-the camera, so the camera looks along -z and the depth of a point is ``-z``. Image: column to the
-right, row downwards, pixel (0, 0) top-left; continuous pixel coordinates have their origin at the
-image's top-left corner, so that the centre of pixel (column, row) is (column + 0.5, row + 0.5).
-Everything is numpy float64 on the host, in millimetres and degrees.
+Camera frame: origin at the camera, x right, y up, +z from the part to the camera, so the camera
+looks along -z and the depth of a point is ``-z``. Image: column to the right, row downwards; the
+centre of pixel (column, row) is (column + 0.5, row + 0.5). All is float64, in mm and degrees.
 """
 
 from __future__ import annotations
@@ -82,12 +80,12 @@ class Camera:
 
     @property
     def cx(self) -> float:
-        """Column coordinate of the optical axis: the middle of the image."""
+        """Column of the optical axis: the middle of the image."""
         return self.width / 2
 
     @property
     def cy(self) -> float:
-        """Row coordinate of the optical axis: the middle of the image."""
+        """Row of the optical axis: the middle of the image."""
         return self.height / 2
 
     def extent_mm(self, depth_mm: float) -> tuple[float, float]:
@@ -98,40 +96,29 @@ class Camera:
     def part_sizes_mm(self) -> tuple[float, float]:
         """The smallest and the largest part that makes sense before this camera.
 
-        The smallest covers a fortieth of the near field's width; no orientation fits a part
-        longer than its diagonal into the far field.
+        A fortieth of the near field's width, and the diagonal of the far field.
         """
         return self.extent_mm(self.near_mm)[0] / 40, math.hypot(*self.extent_mm(self.far_mm))
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Camera-frame points [..., 3] in mm to continuous pixel coordinates [..., 2] f64.
+        """Camera-frame points [..., 3] in mm to continuous (column, row) [..., 2] f64.
 
-        The last axis is (column, row). Points at or behind the camera's plane give NaN; points
-        outside the image give coordinates outside it.
+        NaN at or behind the camera's plane.
         """
         points = np.asarray(points, np.float64)
-        depth = -points[..., 2]
-        depth = np.where(depth > 0, depth, np.nan)
+        depth = np.where(points[..., 2] < 0, -points[..., 2], np.nan)
         column = self.cx + self.fx * points[..., 0] / depth
         row = self.cy - self.fy * points[..., 1] / depth
         return np.stack([column, row], axis=-1)
 
     def slopes(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The x and y, per mm of depth, of the rays through the centres of the pixels, both f64.
-
-        ``columns`` and ``rows`` are pixel indices of any shapes. The ray of a pixel is
-        ``depth * (x, y, -1)``.
-        """
+        """x and y, f64, of the rays ``depth * (x, y, -1)`` through pixels of any shapes."""
         x = (np.asarray(columns, np.float64) + 0.5 - self.cx) / self.fx
         y = (self.cy - 0.5 - np.asarray(rows, np.float64)) / self.fy
         return x, y
 
     def ray_directions(self, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Unit directions [..., 3] f64, camera frame, through the centres of the pixels.
-
-        ``columns`` and ``rows`` are pixel indices of shapes that broadcast to [...]: with
-        ``t > 0``, ``project(t * ray_directions(c, r))`` is ``(c + 0.5, r + 0.5)``.
-        """
+        """Unit directions [..., 3] f64, camera frame, of the rays through pixels."""
         x, y = np.broadcast_arrays(*self.slopes(columns, rows))
         directions = np.stack([x, y, np.full_like(x, -1.0)], axis=-1)
         return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -161,10 +148,9 @@ def look_at(position: np.ndarray, target: np.ndarray) -> RigidTransform:
     """camera_from_part of cameras at ``position`` that look at ``target``: paper, eqs 4 to 7.
 
     ``D = P - target`` (4), ``R = u0 x D`` (5), ``U = D x R`` (6), and camera_from_part has the
-    rows R, U, D and the translation ``-[R U D] P`` (7). As printed the axes are as long as D and
-    D squared, so that M would not be a rigid motion; here each is made a unit vector, which is
-    what the text (three unit axes) says. The up vector ``u0 = (0, 1, 0)`` gives no R for a
-    camera straight above along the part's y axis: there R is +x, which keeps the axes right-handed.
+    rows R, U, D and the translation ``-[R U D] P`` (7); the axes are made unit vectors, as the text
+    says and the equations do not. The up vector ``u0 = (0, 1, 0)`` gives no R for a camera along
+    the part's y axis: there R is +x.
 
     Args:
       position: [..., 3] mm, part frame.
@@ -252,10 +238,9 @@ def hemisphere_viewpoints(
 ) -> Viewpoints:
     """The viewpoints of Algorithm 1, elevation in the outer loop: 6 x 36 = 216 by default.
 
-    ``"sphere"`` is what the text means, a hemisphere of radius r about the part's centre:
+    ``"sphere"`` is what the text means, a hemisphere about the part's centre:
     ``r (cos a cos b, cos a sin b, sin a)``. ``"printed"`` is what the algorithm prints,
-    ``r (sin a cos b, cos a sin b, sin a)``: no sphere, but 490 to 563 mm away at azimuth 0 and
-    180, and r at 90 and 270; for reproduction.
+    ``r (sin a cos b, cos a sin b, sin a)``: no sphere, 490 to 563 mm away at azimuth 0.
 
     Args:
       center: [3] mm, part frame: what the cameras look at (the middle of the CAD part).

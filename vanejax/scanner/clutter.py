@@ -188,13 +188,8 @@ def chips(
     """Curled swarf that fell from above: helical strips of 3 to 15 mm.
 
     Each is 0.5 to 2 mm wide and 0.1 to 0.3 mm thick, curled with a radius of 1 to 4 mm by half a
-    turn to two turns. It is turned at random and lies where it first touches what is below.
-
-    Args:
-      below: of the scene that they fall on.
-      part: around which they fall.
-      rng: of sizes and places.
-      count: how many; fewer where there is nothing below to lie on.
+    turn to two turns. It is turned at random and lies where it first touches what the scanner
+    ``below`` sees; there are fewer than ``count`` where there is nothing to lie on.
     """
     fallen = []
     for place in _places(below, part, rng, count)[0]:
@@ -214,12 +209,7 @@ def coolant_drops(
     """Drops on the upper surface: spherical caps of 1 to 5 mm radius along the surface's normal.
 
     The contact angle is 20 to 70 deg, so that they are a sixth to two thirds of their radius high.
-
-    Args:
-      below: of the scene that they lie on.
-      part: around which they lie.
-      rng: of sizes and places.
-      count: how many; fewer where there is nothing below to lie on.
+    Arguments as those of `chips`.
     """
     drops = []
     for place, normal in zip(*_places(below, part, rng, count), strict=True):

@@ -19,9 +19,8 @@ SIDES = 160
 # of the part's radius, beyond its extent: float32 turns rays by far less, and a flat part gets the
 # thickness that a polytope must have
 PADDING = 1e-3
-VERTICES_AT_ONCE = (
-    512  # few enough that BLAS does not start threads, which wait for the scanning ones
-)
+# few enough that BLAS does not start threads, which wait for the scanning ones
+VERTICES_AT_ONCE = 512
 
 
 class Window(NamedTuple):

@@ -75,11 +75,10 @@ class Trueness:
 def smooth_field(
     rng: np.random.Generator, row: np.ndarray, column: np.ndarray, *, length_px: float
 ) -> np.ndarray:
-    """A Gaussian random field at pixels [N]: mean 0, variance 1 at every one of them.
+    """A Gaussian random field [N] f32 at pixels [N]: mean 0, variance 1 at every one of them.
 
-    White noise on a grid of ``length_px`` is interpolated by cubic B-splines whose weights are
-    normalised to unit squares: pixels ``length_px`` apart correlate by 0.49 on average, twice as
-    far apart by 0.05.
+    White noise on a grid of ``length_px``, interpolated by cubic B-splines of unit square sum:
+    pixels ``length_px`` apart correlate by 0.49 on average, twice as far apart by 0.05.
 
     Raises:
       InputError: a length below one pixel.
@@ -122,16 +121,14 @@ def window_mean(
 ) -> np.ndarray:
     """The mean disparity around each pixel [N] f32, among the pixels given.
 
-    Stereo compares windows, not pixels: it finds the mean disparity of what a window holds, which
-    rounds edges off. More exactly it finds that of the texture in the window, which lies beside the
-    pixel as chance will have it (edge fattening).
+    Stereo compares windows, not pixels: it finds the mean disparity of the texture in a window,
+    which rounds edges off, and which may lie beside the pixel (edge fattening).
 
     Args:
-      row, column: [N] i32, of the pixels that see the part; what lies beside it has no say.
+      row, column: [N] i32, of the pixels that see the part; others do not count.
       disparity: [N] f32.
       window_px: standard deviation of the Gaussian window.
-      offset_px: [2, N], how many rows and columns beside its pixel each window's middle lies; none
-        where the part is no longer there.
+      offset_px: [2, N], rows and columns from the pixel to the middle of its window.
     """
     if not len(row):
         return disparity
@@ -210,7 +207,7 @@ def flying_pixel_errors(
       rng: source of randomness.
       sides: [J] each, from `depth_jumps`.
       disparity: [N] pixels.
-      rate: share of the edges, those at which a pixel is mixed.
+      rate: share of the edges at which a pixel is mixed.
 
     Returns:
       indices of the mixed pixels [m], no two alike, and what is added to their disparity [m].

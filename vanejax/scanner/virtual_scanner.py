@@ -57,9 +57,9 @@ class Scanner:
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """First intersections of any rays with the part, seen from outside.
 
-        A ray that first meets the back of a face counts as a miss: it started inside the solid, or
-        it met a vertex exactly and slipped in, which Embree's robust mode prevents at edges only.
-        Open surfaces are seen from both sides.
+        A ray that first meets the back of a face misses: it started inside the solid, or slipped in
+        at a vertex, which Embree's robust mode prevents at edges only. Open surfaces are seen from
+        both sides.
 
         Args:
           origins: [N, 3] mm, part frame.
@@ -115,9 +115,8 @@ class Scanner:
     ) -> Scan:
         """One view of the part.
 
-        The clip planes work as a renderer's do (the paper renders with PCL): they are depths along
-        the optical axis, what lies before the near plane is cut away, and what stood behind it is
-        then seen, if need be from its inside. Rays start at the near plane for that reason.
+        The clip planes work as a renderer's do (the paper renders with PCL): what lies before the
+        near plane is cut away, and what stood behind it is seen, if need be from its inside.
 
         Args:
           camera: intrinsics.
@@ -201,8 +200,7 @@ class Scanner:
         """The surface samples [H, 3] f32, camera frame, that this view does not see.
 
         A sample is seen when it lies between the clip planes, projects into the image, is not
-        edge-on, and the way from it to the near plane is free. That last test also decides which
-        samples face away: their way leads through the solid.
+        edge-on, and the way from it to the near plane is free; that of one that faces away is not.
         """
         points_local, normals_local = self._surface
         points = camera_from_local.apply(points_local)
@@ -259,11 +257,7 @@ class Scanner:
         return lit
 
     def _refuse_camera_inside(self, camera_from_local: RigidTransform) -> None:
-        """Raises InputError for a camera inside the solid.
-
-        That is where the first face in any direction is seen from its back. The direction taken is
-        that of the face that looks largest from the camera, so that it is neither edge-on nor far.
-        """
+        """Raises InputError for a camera that sees the back of the face that looks largest."""
         eye = camera_from_local.inverse().translation
         if np.linalg.norm(eye) > self._radius:
             return
