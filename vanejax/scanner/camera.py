@@ -112,7 +112,7 @@ class Camera:
         return np.stack([column, row], axis=-1)
 
     def slopes(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """x and y, f64, of the rays ``depth * (x, y, -1)`` through pixels of any shapes."""
+        """X and y, f64, of the rays ``depth * (x, y, -1)`` through pixels of any shapes."""
         x = (np.asarray(columns, np.float64) + 0.5 - self.cx) / self.fx
         y = (self.cy - 0.5 - np.asarray(rows, np.float64)) / self.fy
         return x, y

@@ -20,9 +20,8 @@ from vanejax.scans.point_records import (
     PointFile,
     check_count,
     read_records,
-    read_text_rows,
+    read_text_records,
     refuse_rest,
-    split_columns,
     wanted_columns,
 )
 
@@ -53,7 +52,7 @@ def read_pcd(path: Path) -> PointFile:
         if encoding == "ascii":
             values = sum(field.count for field in fields)
             check_count(path, count, 2 * values - 1, held)
-            points, normals = _read_text(path, fields, count, lines)
+            points, normals = read_text_records(path, fields, count, skip_lines=lines)
         elif encoding == "binary":
             check_count(path, count, row_bytes, held)
             points, normals = read_records(file, fields, count, path)
@@ -66,12 +65,8 @@ def read_pcd(path: Path) -> PointFile:
                 f"{path}: PCD data {encoding!r} is not known; save it as ascii, binary or "
                 "binary_compressed"
             )
-    return PointFile(
-        points=points,
-        normals=normals,
-        format="PCD, " + encoding.replace("_", " "),
-        viewpoint=_viewpoint(header, path),
-    )
+    kind = "PCD, " + encoding.replace("_", " ")
+    return PointFile(points, normals, kind, viewpoint=_viewpoint(header, path))
 
 
 def _header(file: BinaryIO, path: Path) -> tuple[dict[str, list[str]], int]:
@@ -145,25 +140,8 @@ def _viewpoint(header: dict[str, list[str]], path: Path) -> np.ndarray | None:
             f"{path}: VIEWPOINT {' '.join(header['VIEWPOINT'])[:60]!r} of its header is no pose"
         ) from error
     position = values[:3]
-    return (
-        position if len(position) == 3 and np.isfinite(position).all() and any(position) else None
-    )
-
-
-def _read_text(
-    path: Path, fields: list[Field], count: int, skip_lines: int
-) -> tuple[np.ndarray, np.ndarray | None]:
-    points, normals = wanted_columns([field.name for field in fields], path)
-    first = np.cumsum([0] + [field.count for field in fields])
-    columns = [int(first[i]) for i in points + normals]
-    rows = read_text_rows(path, columns, skip_lines=skip_lines, max_rows=count + 1)
-    if len(rows) != count:
-        held = f"{len(rows):,}" if len(rows) < count else "more"
-        raise InputError(
-            f"{path}: truncated, or its header is wrong: it promises {count:,} points and holds "
-            f"{held}; copy or export it again"
-        )
-    return split_columns(rows)
+    stated = len(position) == 3 and np.isfinite(position).all() and any(position)
+    return position if stated else None
 
 
 def _read_compressed(

@@ -15,10 +15,8 @@ from vanejax.scans.point_records import (
     PointFile,
     check_count,
     read_records,
-    read_text_rows,
+    read_text_records,
     refuse_rest,
-    split_columns,
-    wanted_columns,
 )
 
 _CODES = {
@@ -69,11 +67,9 @@ def read_ply(path: Path) -> PointFile:
             )
         text = encoding == "ascii"
         # in text, a value takes a digit and a separator
-        check_count(
-            path, vertex.count, 2 * len(vertex.fields) if text else vertex.least_bytes, held
-        )
         least = [2 * len(e.fields) if text else e.least_bytes for e in elements]
-        promised = sum(e.count * bytes_ for e, bytes_ in zip(elements, least, strict=True))
+        check_count(path, vertex.count, least[place], held)
+        promised = sum(e.count * size for e, size in zip(elements, least, strict=True))
         if promised > held + text:  # text may end without a separator
             counts = ", ".join(f"{element.count:,} of {element.name}" for element in elements)
             raise InputError(
@@ -83,7 +79,9 @@ def read_ply(path: Path) -> PointFile:
         last = place == len(elements) - 1
         if text:
             skip = header_lines + sum(element.count for element in elements[:place])
-            points, normals = _read_text(path, vertex, skip, last)
+            points, normals = read_text_records(
+                path, vertex.fields, vertex.count, skip_lines=skip, last=last
+            )
         else:
             for element in elements[:place]:
                 _skip(file, element, path)
@@ -91,12 +89,7 @@ def read_ply(path: Path) -> PointFile:
             if last:
                 refuse_rest(file, vertex.least_bytes, path)
     faces = sum(element.count for element in elements if element.name in ("face", "tristrips"))
-    return PointFile(
-        points=points,
-        normals=normals,
-        format="PLY, " + encoding.replace("_", " "),
-        num_faces=faces,
-    )
+    return PointFile(points, normals, "PLY, " + encoding.replace("_", " "), num_faces=faces)
 
 
 def _header(file: BinaryIO, path: Path) -> tuple[str, list[_Element], int]:
@@ -135,23 +128,6 @@ def _header(file: BinaryIO, path: Path) -> tuple[str, list[_Element], int]:
     if not encoding:
         raise InputError(f"{path}: its PLY header states no format; export it again")
     return encoding, elements, number
-
-
-def _read_text(
-    path: Path, vertex: _Element, skip_lines: int, last: bool
-) -> tuple[np.ndarray, np.ndarray | None]:
-    points, normals = wanted_columns([field.name for field in vertex.fields], path)
-    rows = read_text_rows(
-        path, points + normals, skip_lines=skip_lines, max_rows=vertex.count + last
-    )
-    if len(rows) != vertex.count:
-        problem = "truncated" if len(rows) < vertex.count else "its header is wrong"
-        held = f"{len(rows):,}" if len(rows) < vertex.count else "more"
-        raise InputError(
-            f"{path}: {problem}: it promises {vertex.count:,} points and holds {held}; copy or "
-            "export it again"
-        )
-    return split_columns(rows)
 
 
 def _skip(file: BinaryIO, element: _Element, path: Path) -> None:

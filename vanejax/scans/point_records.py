@@ -10,7 +10,7 @@ import dataclasses
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -72,30 +72,29 @@ def wanted_columns(names: Sequence[str], path: Path) -> tuple[list[int], list[in
       InputError: x, y or z is missing.
     """
     lower = [name.lower() for name in names]
-    points = _first_complete(lower, POINT_NAMES)
+    points, normals = (
+        next(
+            (
+                [lower.index(name) for name in choice]
+                for choice in choices
+                if set(choice) <= set(lower)
+            ),
+            [],
+        )
+        for choices in (POINT_NAMES, NORMAL_NAMES)
+    )
     if not points:
         raise InputError(
             f"{path}: has no columns x, y and z, only {', '.join(names[:12]) or 'none'}; export "
             "the points with their coordinates"
         )
-    return points, _first_complete(lower, NORMAL_NAMES)
-
-
-def _first_complete(names: list[str], choices: Sequence[Sequence[str]]) -> list[int]:
-    for choice in choices:
-        if all(name in names for name in choice):
-            return [names.index(name) for name in choice]
-    return []
+    return points, normals
 
 
 def check_count(path: Path, count: int, bytes_per_point: int, held: int) -> None:
     """Refuses a promised number of points that is zero, too large, or not there.
 
-    Args:
-      path: for the message.
-      count: points that the header promises.
-      bytes_per_point: that a point takes at least.
-      held: bytes in the file after the header.
+    A point takes ``bytes_per_point`` at least, and the file has ``held`` bytes after its header.
 
     Raises:
       InputError: see above.
@@ -140,30 +139,43 @@ def read_records(
     return points, normals
 
 
-def read_text_rows(
-    path: Path,
-    columns: Sequence[int],
-    *,
-    skip_lines: int,
-    max_rows: int | None = None,
-    delimiter: str | None = None,
-    comments: str | None = None,
-    encoding: str = "latin-1",
-) -> np.ndarray:
-    """Numbers [N, len(columns)] f64 of a table in a text file.
+def read_text_records(
+    path: Path, fields: Sequence[Field], count: int, *, skip_lines: int, last: bool = True
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points [N, 3] f64 and normals [N, 3] f32 or None of a line for each point.
 
     Args:
       path: the file.
-      columns: which columns, from 0.
-      skip_lines: lines before the first row.
-      max_rows: no more than these; None for all.
-      delimiter: between columns; None for white space.
-      comments: what starts a comment.
-      encoding: of the file; latin-1 takes any bytes.
+      fields: the columns of a line.
+      count: of the lines that the header promises.
+      skip_lines: before the first.
+      last: whether the file ends after them.
+
+    Raises:
+      InputError: a coordinate is missing, something is not a number, or there are more or fewer.
+    """
+    points, normals = wanted_columns([field.name for field in fields], path)
+    first = np.cumsum([0] + [field.count for field in fields])
+    columns = [int(first[i]) for i in points + normals]
+    rows = read_text_rows(path, columns, skip_lines=skip_lines, max_rows=count + last)
+    if len(rows) != count:
+        held = f"{len(rows):,}" if len(rows) < count else "more"
+        raise InputError(
+            f"{path}: truncated, or its header is wrong: it promises {count:,} points and holds "
+            f"{held}; copy or export it again"
+        )
+    return split_columns(rows)
+
+
+def read_text_rows(
+    path: Path, columns: Sequence[int], *, skip_lines: int, **options: Any
+) -> np.ndarray:
+    """Numbers [N, len(columns)] f64 of a table in a text file; further options of `np.loadtxt`.
 
     Raises:
       InputError: something is not a number, or a row is too short; the message says where.
     """
+    options = {"comments": None, "encoding": "latin-1"} | options  # latin-1 takes any bytes
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # that it passes over blank lines
@@ -171,14 +183,11 @@ def read_text_rows(
             return np.loadtxt(
                 str(path.absolute()),
                 np.float64,
-                comments=comments,
-                delimiter=delimiter,
                 skiprows=skip_lines,
                 usecols=columns,
                 ndmin=2,
-                max_rows=max_rows,
-                encoding=encoding,
                 quotechar='"',
+                **options,
             )
     except ValueError as error:
         reason = " ".join(str(error).split())[:200]
