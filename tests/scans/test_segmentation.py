@@ -11,7 +11,8 @@ from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
 from vanejax.scanner.clutter import Clutter, ClutterObject, ClutterScene, clutter_scene, table
-from vanejax.scans.segmentation import Segment, is_larger, largest_slab_mm2, segment
+from vanejax.scans.segmentation import Segment, is_larger, segment
+from vanejax.scans.table_planes import largest_slab_mm2
 
 CAMERA = Camera(width=400, height=320, near_mm=200.0)
 ORIGIN = np.zeros(3)

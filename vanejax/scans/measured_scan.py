@@ -101,20 +101,32 @@ def clean_scan(
             )
     given = len(points)
     notes: list[str] = []
-    points, normals = _measured_only(points, normals, notes)
+    points, normals = _without(
+        points, normals, ~measured(points), "without a measurement (not finite)", notes
+    )
+    zero = at_place(points, np.zeros(3))
+    if np.count_nonzero(zero) > 1:
+        points, normals = _without(points, normals, zero, "without a measurement (0, 0, 0)", notes)
     normals, bad = _unit_normals(normals, notes)
     if bad is not None:
-        points, normals = points[~bad], normals[~bad]
+        points, normals = _without(
+            points, normals, bad, "whose normal is zero or not finite", notes
+        )
     double = repeats(points)
     if double is not None:
-        notes.append(f"dropped {int(double.sum()):,} points that repeat another exactly")
-        points = points[~double]
-        normals = None if normals is None else normals[~double]
+        points, normals = _without(points, normals, double, "that repeat another exactly", notes)
     if len(points) < MIN_POINTS:
-        raise InputError(_too_few(name, given, len(points), notes))
+        dropped = f" ({'; '.join(notes)})" if notes else ""
+        raise InputError(
+            f"{name}: {len(points)} distinct points are left of {given:,}{dropped}; "
+            f"a pose needs at least {MIN_POINTS}"
+        )
     _refuse_line(points, name)
     origin, reason = _sensor(points, sensor_origin, stated_origin, name)
-    points, normals = _without_origin(points, normals, origin, notes)
+    if origin is not None:  # a ray to the sensor itself has no direction
+        points, normals = _without(
+            points, normals, at_place(points, origin), "at the sensor's place", notes
+        )
     notes.append(reason)
     if normals is not None and origin is not None:
         normals = _towards(points, normals, origin, notes)
@@ -127,10 +139,8 @@ def clean_scan(
 
 def measured(points: np.ndarray) -> np.ndarray:
     """[N] bool, which of the points [N, 3], in any unit, are finite and not absurdly far away."""
-    near = np.abs(points[:, 0]) < _NOWHERE_MM  # False for NaN
-    for axis in (1, 2):
-        near &= np.abs(points[:, axis]) < _NOWHERE_MM
-    return near
+    # column by column, which is faster; False for NaN
+    return np.logical_and.reduce([np.abs(points[:, axis]) < _NOWHERE_MM for axis in range(3)])
 
 
 def at_place(points: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -139,35 +149,15 @@ def at_place(points: np.ndarray, place: np.ndarray) -> np.ndarray:
     return (points[:, 2] == z) & (points[:, 0] == x) & (points[:, 1] == y)
 
 
-def _measured_only(
-    points: np.ndarray, normals: np.ndarray | None, notes: list[str]
+def _without(
+    points: np.ndarray, normals: np.ndarray | None, bad: np.ndarray, why: str, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Without points that are not finite, and without (0, 0, 0) where it stands for nothing."""
-    keep = measured(points)
-    lost = len(points) - int(np.count_nonzero(keep))
-    if lost:
-        notes.append(f"dropped {lost:,} points without a measurement (not finite)")
-    zero = at_place(points, np.zeros(3))
-    if np.count_nonzero(zero) > 1:
-        notes.append(f"dropped {np.count_nonzero(zero):,} points without a measurement (0, 0, 0)")
-        keep &= ~zero
-        lost = 1
-    if not lost:
+    """Points and normals without the ``bad`` [N] bool, and a note that says so."""
+    count = int(np.count_nonzero(bad))
+    if not count:
         return points, normals
-    return points[keep], None if normals is None else normals[keep]
-
-
-def _without_origin(
-    points: np.ndarray, normals: np.ndarray | None, origin: np.ndarray | None, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Without points at the sensor's place: their ray has no direction."""
-    if origin is None:
-        return points, normals
-    there = at_place(points, origin)
-    if not there.any():
-        return points, normals
-    notes.append(f"dropped {np.count_nonzero(there):,} points at the sensor's place")
-    return points[~there], None if normals is None else normals[~there]
+    notes.append(f"dropped {count:,} points {why}")
+    return points[~bad], None if normals is None else normals[~bad]
 
 
 def _unit_normals(
@@ -188,10 +178,7 @@ def _unit_normals(
             )
             return None, None
         normals = normals / np.sqrt(squared)[:, None]
-    if not count:
-        return normals, None
-    notes.append(f"dropped {count:,} points whose normal is zero or not finite")
-    return normals, bad
+    return normals, bad if count else None
 
 
 def _sensor(
@@ -266,11 +253,3 @@ def _refuse_line(points: np.ndarray, name: str) -> None:
             f"{2 * spread[2]:.3g} mm): the part could turn about it and fit as well, so no pose "
             "follows; scan an area of the part"
         )
-
-
-def _too_few(name: str, given: int, left: int, notes: list[str]) -> str:
-    dropped = f" ({'; '.join(notes)})" if notes else ""
-    return (
-        f"{name}: {left} distinct points are left of {given:,}{dropped}; a pose needs at least "
-        f"{MIN_POINTS}"
-    )

@@ -13,28 +13,19 @@ import dataclasses
 import enum
 
 import numpy as np
-from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.scans.robust_statistics import robust_sigma
+from vanejax.scans.table_planes import Plane, find_tables, with_noise_thickness
 from vanejax.scans.viewpoint import sampled_rows
 from vanejax.scans.voxels import Voxels
 
 VOXELS_PER_RADIUS = 60.0
 POINTS_PER_VOXEL = 3.0  # fewer, and a surface falls apart into its points
-MOST_GROWTHS = 12
-PLANES_TRIED = 3
-TRIPLETS = 600
-TRIPLET_POINTS = 3_000
-# of the part's radius: what a plane is sought with, and the bounds of what it is taken away with
-PLANE_REACH, LEAST_THICKNESS, MOST_THICKNESS = 0.01, 0.004, 0.12
-THICKNESS_SIGMAS, THICKNESS_POINTS = 4.0, 50_000
-# a plane of the part is not wider than the part, nor larger than its largest flat face
-WIDER, LARGER = 1.1, 1.5
-BEHIND_SHARE = 0.05  # of what is not the table, what may lie behind it: strays, its own edge
+MAX_VOXEL_STEPS = 12  # in which the voxels become larger
+THICKNESS_POINTS = 50_000
 LARGER_PART = 1.03  # how much wider than the part its pieces together may be
 NOISE = 0.02  # and by how much of its radius
 LEAST_PIECE = 0.02  # of the largest piece: smaller ones that stand on the table are chips on it
@@ -49,25 +40,6 @@ class Segment(enum.IntEnum):
     PART = 0
     TABLE = 1
     OTHER = 2
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Plane:
-    """Points x with ``normal @ x = offset_mm``.
-
-    Attributes:
-      normal: [3] f64, unit, towards what stands on it.
-      offset_mm: along it.
-      thickness_mm: points nearer than this were taken for the table.
-    """
-
-    normal: np.ndarray
-    offset_mm: float
-    thickness_mm: float
-
-    def height_mm(self, points: np.ndarray) -> np.ndarray:
-        """[N] f64 of points [N, 3], mm: above the plane."""
-        return points @ self.normal - self.offset_mm
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -120,10 +92,10 @@ def segment(
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise InputError(f"segmentation needs [N, 3] points in mm, got {list(points.shape)}")
     voxels = _voxels(points, part)
-    tables = _tables(voxels, part, sensor_origin, seed)
+    tables = find_tables(voxels, part, sensor_origin, seed)
     label = np.full(len(points), Segment.PART, np.uint8)
     some = points[sampled_rows(len(points), THICKNESS_POINTS)]
-    tables = tuple(_with_thickness(table, some, part) for table in tables)
+    tables = tuple(with_noise_thickness(table, some, part) for table in tables)
     for table in tables:
         label[np.abs(table.height_mm(points)) <= table.thickness_mm] = Segment.TABLE
     rest = np.flatnonzero(label == Segment.PART)
@@ -138,127 +110,12 @@ def _voxels(points: np.ndarray, part: Part) -> Voxels:
     # a stray far away would need a grid beyond 64 bits
     widest = max(float(np.ptp(points[:, k])) for k in range(3))
     size = max(part.radius / VOXELS_PER_RADIUS, widest / 2**20)
-    for _ in range(MOST_GROWTHS):
+    for _ in range(MAX_VOXEL_STEPS):
         voxels = Voxels.of(points, size)
         if len(points) >= POINTS_PER_VOXEL * len(voxels):
             break
         size *= 1.3
     return voxels
-
-
-def _tables(
-    voxels: Voxels, part: Part, sensor_origin: np.ndarray | None, seed: int
-) -> tuple[Plane, ...]:
-    """The planes that are none of the part's, largest first."""
-    rng = np.random.default_rng([seed, len(voxels.of_point)])
-    middle = voxels.middle
-    left, untried = np.ones(len(middle), bool), np.ones(len(middle), bool)
-    tables: list[Plane] = []
-    for _ in range(PLANES_TRIED):
-        some = middle[left & untried]
-        if len(some) < 3:
-            break
-        plane = _best_plane(some, part, rng)
-        on = np.abs(plane.height_mm(middle)) <= plane.thickness_mm
-        standing = _standing(plane, middle[left & ~on], sensor_origin)
-        if standing is not None and _is_beyond(part, plane, middle[left & on], voxels.size_mm):
-            tables.append(standing)
-            left &= ~on
-        untried &= ~on
-    return tuple(tables)
-
-
-def _best_plane(middle: np.ndarray, part: Part, rng: np.random.Generator) -> Plane:
-    """The plane through three of the points [V, 3] that most others lie on, fitted to those."""
-    some = middle[rng.integers(len(middle), size=min(TRIPLET_POINTS, len(middle)))]
-    normal, offset = _random_planes(middle, rng)
-    on = np.count_nonzero(np.abs(some @ normal.T - offset) <= PLANE_REACH * part.radius, axis=0)
-    best = int(np.argmax(on))
-    plane = Plane(normal[best], float(offset[best]), 2 * PLANE_REACH * part.radius)
-    for _ in range(3):
-        near = middle[np.abs(plane.height_mm(middle)) <= plane.thickness_mm]
-        if len(near) < 3:
-            break
-        mean = near.mean(axis=0)
-        normal = np.linalg.eigh((near - mean).T @ (near - mean))[1][:, 0]
-        offset = float(normal @ mean)
-        height = np.abs(middle @ normal - offset)
-        close = height[height <= 2 * plane.thickness_mm]
-        sigma = float(robust_sigma(close)) if len(close) else 0.0
-        plane = Plane(normal, offset, _thickness_mm(sigma, part))
-    return plane
-
-
-def _with_thickness(plane: Plane, points: np.ndarray, part: Part) -> Plane:
-    """As thick as the noise of the points [N, 3]; the means of voxels have less."""
-    height = np.abs(plane.height_mm(points))
-    thickness = 2 * PLANE_REACH * part.radius
-    for _ in range(3):
-        sigma = float(robust_sigma(height[height <= 2 * thickness]))
-        thickness = _thickness_mm(sigma, part)
-    return dataclasses.replace(plane, thickness_mm=thickness)
-
-
-def _thickness_mm(sigma_mm: float, part: Part) -> float:
-    least, most = LEAST_THICKNESS * part.radius, MOST_THICKNESS * part.radius
-    return float(np.clip(THICKNESS_SIGMAS * sigma_mm, least, most))
-
-
-def _random_planes(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals [T, 3] and offsets [T], mm, of planes through three of the points [V, 3]."""
-    a, b, c = points[rng.integers(len(points), size=(3, TRIPLETS))]
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1)
-    # three points on a line fix no plane
-    normal, a = normal[length > 0] / length[length > 0, None], a[length > 0]
-    return normal, np.einsum("ni,ni->n", normal, a)
-
-
-def _standing(plane: Plane, others: np.ndarray, sensor_origin: np.ndarray | None) -> Plane | None:
-    """The plane with its normal to the side on which all else stands; None if there is none."""
-    if not len(others):
-        return None
-    above = float(np.mean(plane.height_mm(others) > 0))
-    if min(above, 1 - above) > BEHIND_SHARE:
-        return None
-    if above < 0.5:
-        plane = Plane(-plane.normal, -plane.offset_mm, plane.thickness_mm)
-    if sensor_origin is not None and plane.height_mm(np.asarray(sensor_origin)[None])[0] <= 0:
-        return None
-    return plane
-
-
-def _is_beyond(part: Part, plane: Plane, on: np.ndarray, size_mm: float) -> bool:
-    """Whether a connected patch of the plane, points [V, 3], is more than any face of the part."""
-    axes = np.linalg.svd(plane.normal[None])[2][1:]
-    cell_mm = 3 * size_mm
-    cell = np.floor(on @ axes.T / cell_mm).astype(np.int64)
-    cell -= cell.min(axis=0)
-    # of the table, which is millions of cells only where a stray lies far away in the plane
-    cell = cell[(cell < 4096).all(axis=1)]
-    image = np.zeros(cell.max(axis=0) + 1, bool)
-    image[cell[:, 0], cell[:, 1]] = True
-    patch, _ = ndimage.label(image, np.ones((3, 3)))
-    largest = np.argwhere(patch == 1 + np.argmax(np.bincount(patch[image])[1:]))
-    angle = np.radians(np.arange(0, 180, 5))
-    across = largest @ np.stack([np.cos(angle), np.sin(angle)])
-    width = cell_mm * float(np.ptp(across, axis=0).max())
-    if width > WIDER * 2 * part.radius:
-        return True
-    area = len(largest) * cell_mm**2 - 4 * cell_mm * width  # less a cell all around
-    return area > LARGER * largest_slab_mm2(part, 2 * plane.thickness_mm)
-
-
-def largest_slab_mm2(part: Part, thickness_mm: float, *, seed: int = 0) -> float:
-    """Area of the part's surface that lies within a thickness of one plane, the most there is.
-
-    Of both sides and of curved surface too: a table must be larger than what any view could take
-    for one.
-    """
-    some = part.sample(4_000, seed)[0]
-    normal, offset = _random_planes(some, np.random.default_rng(seed))
-    on = np.abs(some @ normal.T - offset) <= thickness_mm
-    return float(part.triangles.areas().sum() * np.mean(on, axis=0).max())
 
 
 def _part_of(
