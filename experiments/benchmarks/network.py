@@ -12,7 +12,7 @@ from experiments.benchmarks.flops import inference_flops, step_flops
 from experiments.benchmarks.timing import Bench, Figure
 from experiments.benchmarks.vane_pairs import VanePairs
 from experiments.runner import machine
-from vanejax.matching.rpmnet import last_match
+from vanejax.matching import fast_rpmnet
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.training.pairs import Pair
@@ -93,15 +93,13 @@ def registering(pairs: VanePairs) -> Callable[[], RigidTransform]:
     """A registration of one pair, the reference's features computed before."""
     model, variables = pairs.config.make_network().model, pairs.state().variables
     pair = pairs.pair(0)
-    features = jax.jit(lambda variables, cloud: model.apply(variables, cloud, method="features"))(
-        variables, pair.target
-    )
+    features = jax.jit(fast_rpmnet.features, static_argnums=0)(model, variables, pair.target)
 
     @jax.jit
     def infer(
         variables: Any, source: PointCloud, target: PointCloud, features: jax.Array
     ) -> RigidTransform:
-        match = last_match(
+        match = fast_rpmnet.last_match(
             model,
             variables,
             source,

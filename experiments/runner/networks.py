@@ -14,7 +14,8 @@ from vanejax.matching.baselines.dcp import Dcp, dcp
 from vanejax.matching.baselines.pcrnet import PcrNet, pcrnet
 from vanejax.matching.baselines.pointnetlk import PointNetLK, pointnetlk
 from vanejax.matching.contract import Register, Registration
-from vanejax.matching.rpmnet import RpmNet, rpmnet
+from vanejax.matching.fast_rpmnet import rpmnet
+from vanejax.matching.rpmnet import RpmNet
 from vanejax.training.dcp_loss import DcpLoss
 from vanejax.training.pointnet_losses import PcrNetLoss, PointNetLKLoss
 from vanejax.training.rpmnet_loss import RpmNetLoss

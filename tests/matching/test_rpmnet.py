@@ -1,4 +1,4 @@
-"""RPM-Net: the published code's numbers, a slow float64 twin, padding, and the contract."""
+"""RPM-Net: the plain form against a numpy twin and the published code, the fast form against it."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.special
+from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
 
-from vanejax.errors import InputError
-from vanejax.matching.rpmnet import RpmNet, last_match, rpmnet
+from vanejax.matching import fast_rpmnet
+from vanejax.matching.rpmnet import Match, RpmNet
 from vanejax.matching.torch_weights import load_state_dict, rpmnet_variables
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 
 PARITY = Path(__file__).parents[3] / "shared" / "parity"
 N, M, K = 40, 50, 5
+ROWS = (N + 17, M + 30)  # with padding
 EXACT = 1e-9  # f64 eps x the network's condition of about 1e5
+MODEL = RpmNet(num_neighbors=K, radius=0.5, sinkhorn_iterations=3)
 WIDTHS = {  # name in the state dict: widths, axes of a weight before and after the pooling
     "feat_extractor": ((10, 96, 96, 192), (192, 192, 96, 96), 4, 3),
     "weights_net": ((4, 64, 64, 64, 128, 1024), (1024, 512, 256, 2), 3, 2),
@@ -29,9 +32,9 @@ WIDTHS = {  # name in the state dict: widths, axes of a weight before and after 
 
 
 @functools.cache
-def state_dict(seed: int = 0) -> dict[str, np.ndarray]:
+def state_dict() -> dict[str, np.ndarray]:
     """Random weights under PyTorch's names and in its shapes; gains of both signs."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     state = {}
     for net, (before, after, *axes) in WIDTHS.items():
         for label, widths, ndim in (("prepool", before, axes[0]), ("postpool", after, axes[1])):
@@ -47,61 +50,44 @@ def state_dict(seed: int = 0) -> dict[str, np.ndarray]:
                     state[f"{norm}.bias"] = rng.normal(size=out, scale=0.3)
     # random features lie 0.003 to 0.2 apart: beta must tell them apart, alpha lie in their midst
     state["weights_net.postpool.6.bias"] = np.array([300.0, -4.0])
-    # as the importer keeps them: f32
     return {name: value.astype(np.float32) for name, value in state.items()}
 
 
 @functools.cache
-def random_variables() -> dict:
-    return rpmnet_variables(state_dict())
+def variables(dtype: type = np.float32) -> dict:
+    return jax.tree.map(dtype, rpmnet_variables(state_dict()))
 
 
 @functools.cache
-def exact_variables() -> dict:
-    return jax.tree.map(np.float64, random_variables())
-
-
-@functools.cache
-def problem(seed: int = 0) -> tuple[np.ndarray, ...]:
+def problem() -> tuple[np.ndarray, ...]:
     """Two views of a bumpy sphere: source xyz and normals [N, 3], target's [M, 3]; f64."""
-    rng = np.random.default_rng(seed)
-    normals = rng.normal(size=(N + M, 3))
+    normals = np.random.default_rng(0).normal(size=(N + M, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     xyz = normals * (0.6 + 0.1 * np.sin(5 * normals[:, :1]))
     turn = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
     return xyz[:N] @ turn.T + [0.1, 0, -0.1], normals[:N] @ turn.T, xyz[N:], normals[N:]
 
 
-def cloud(xyz: np.ndarray, normals: np.ndarray, rows: int | None = None, seed: int = 0):
+def cloud(xyz: np.ndarray, normals: np.ndarray, rows: int) -> PointCloud:
     """A cloud whose padding lies scattered among the real points and repeats one of them."""
-    rows = len(xyz) if rows is None else rows
-    place = np.sort(np.random.default_rng(seed).permutation(rows)[: len(xyz)])
-    mask = np.isin(np.arange(rows), place)
+    place = np.sort(np.random.default_rng(rows).permutation(rows)[: len(xyz)])
     padded = [np.repeat(values[3:4], rows, axis=0) for values in (xyz, normals)]
     for full, values in zip(padded, (xyz, normals), strict=True):
         full[place] = values
-    return PointCloud(xyz=padded[0], normals=padded[1], mask=mask)
+    return PointCloud(*padded, np.isin(np.arange(rows), place))
 
 
-MODEL = RpmNet(num_neighbors=K, radius=0.5, sinkhorn_iterations=3)
-WIDE = MODEL.clone(num_neighbors=N + M)
+def clouds(dtype: type = np.float32) -> tuple[PointCloud, PointCloud]:
+    xyz, normals, *target = (values.astype(dtype) for values in problem())
+    return cloud(xyz, normals, ROWS[0]), cloud(*target, ROWS[1])
 
 
-@functools.partial(jax.jit, static_argnames=("model", "iterations"))
-def run(model, variables, source, target, iterations=2):
-    return model.apply(variables, source, target, RigidTransform.identity(), iterations)
+# ---- the plain form
 
 
-@functools.partial(jax.jit, static_argnames="model")
-def features(model, variables, cloud):
-    return model.apply(variables, cloud, method="features")
-
-
-# ---- the slow twin: numpy float64, from the paper and the PyTorch layers it names ----
-
-
-def slow_mlp(x: np.ndarray, state: dict, name: str, groups: list[int]) -> np.ndarray:
+def twin_mlp(x: np.ndarray, name: str, groups: list[int]) -> np.ndarray:
     """Linear, group norm over all points of the cloud, ReLU; no norm where groups is 0."""
+    state = state_dict()
     for layer, count in enumerate(groups):
         weight = state[f"{name}.{3 * layer}.weight"].astype(float)
         x = x @ weight.reshape(weight.shape[:2]).T + state[f"{name}.{3 * layer}.bias"]
@@ -114,227 +100,278 @@ def slow_mlp(x: np.ndarray, state: dict, name: str, groups: list[int]) -> np.nda
     return x
 
 
-def slow_angle(a: np.ndarray, b: np.ndarray) -> float:
+def twin_angle(a: np.ndarray, b: np.ndarray) -> float:
     length = np.linalg.norm(a) * np.linalg.norm(b)
     return np.arccos(np.clip(a @ b / length, -1, 1)) if length else 0.0
 
 
-def slow_features(xyz, normals, state, num_neighbors, radius) -> np.ndarray:
+def twin_features(xyz: np.ndarray, normals: np.ndarray) -> np.ndarray:
     rows = []
-    for i, (point, normal) in enumerate(zip(xyz, normals, strict=True)):
-        near = [j for j in range(len(xyz)) if j != i and np.linalg.norm(xyz[j] - point) <= radius]
+    for i, (p, n) in enumerate(zip(xyz, normals, strict=True)):
+        near = [j for j in range(len(xyz)) if j != i and np.linalg.norm(xyz[j] - p) <= MODEL.radius]
         row = []
-        for j in (near + [i] * num_neighbors)[:num_neighbors]:
-            offset = xyz[j] - point
-            angles = [
-                slow_angle(normal, offset),
-                slow_angle(normals[j], offset),
-                slow_angle(normal, normals[j]),
-            ]
-            row.append([*point, *offset, *angles, np.linalg.norm(offset)])
+        for j in (near + [i] * K)[:K]:
+            offset, other = xyz[j] - p, normals[j]
+            angles = (twin_angle(n, offset), twin_angle(other, offset), twin_angle(n, other))
+            row.append([*p, *offset, *angles, np.linalg.norm(offset)])
         rows.append(row)
-    x = slow_mlp(np.array(rows), state, "feat_extractor.prepool", [8, 8, 8]).max(axis=1)
-    x = slow_mlp(x, state, "feat_extractor.postpool", [8, 8, 0])
+    x = twin_mlp(np.array(rows), "feat_extractor.prepool", [8, 8, 8]).max(axis=1)
+    x = twin_mlp(x, "feat_extractor.postpool", [8, 8, 0])
     return x / np.linalg.norm(x, axis=-1, keepdims=True)
 
 
-def slow_rpmnet(source, target, state, model: RpmNet, iterations: int) -> list[dict]:
-    (xyz, normals), (target_xyz, target_normals) = source, target
-    args = (state, model.num_neighbors, model.radius)
-    target_features = slow_features(target_xyz, target_normals, *args)
+@functools.cache
+def twin_matches() -> list[dict]:
+    """From the paper and the PyTorch layers it names: numpy float64, no padding."""
+    xyz, normals, target, target_normals = problem()
     rotation, translation, results = np.eye(3), np.zeros(3), []
-    for _ in range(iterations):
+    for _ in range(2):
         moved = xyz @ rotation.T + translation
-        found = slow_features(moved, normals @ rotation.T, *args)
-        flags = np.repeat([0.0, 1.0], [len(xyz), len(target_xyz)])[:, None]
-        x = np.concatenate([np.concatenate([moved, target_xyz]), flags], -1)
-        x = slow_mlp(x, state, "weights_net.prepool", [8, 8, 8, 8, 16]).max(axis=0)
-        x = slow_mlp(x[None], state, "weights_net.postpool", [16, 16, 0])[0]
+        flags = np.repeat([0.0, 1.0], [N, M])[:, None]
+        x = np.concatenate([np.concatenate([moved, target]), flags], -1)
+        x = twin_mlp(x, "weights_net.prepool", [8, 8, 8, 8, 16]).max(axis=0)
+        x = twin_mlp(x[None], "weights_net.postpool", [16, 16, 0])[0]
         beta, alpha = np.log1p(np.exp(x))
-        squared = np.sum((found[:, None] - target_features[None]) ** 2, -1)
-        log_p = np.zeros((len(xyz) + 1, len(target_xyz) + 1))
-        log_p[:-1, :-1] = -beta * (squared - alpha)
-        for _ in range(model.sinkhorn_iterations):
-            log_p[:-1] -= scipy.special.logsumexp(log_p[:-1], axis=1, keepdims=True)
-            log_p[:, :-1] -= scipy.special.logsumexp(log_p[:, :-1], axis=0, keepdims=True)
-        p = np.exp(log_p[:-1, :-1])
-        weights = p.sum(axis=1)
-        partners = p @ target_xyz / (weights[:, None] + 1e-5)
+        features = twin_features(moved, normals @ rotation.T), twin_features(target, target_normals)
+        squared = np.sum((features[0][:, None] - features[1][None]) ** 2, -1)
+        log_m = np.zeros((N + 1, M + 1))
+        log_m[:-1, :-1] = -beta * (squared - alpha)
+        for _ in range(MODEL.sinkhorn_iterations):
+            log_m[:-1] -= scipy.special.logsumexp(log_m[:-1], axis=1, keepdims=True)
+            log_m[:, :-1] -= scipy.special.logsumexp(log_m[:, :-1], axis=0, keepdims=True)
+        m = np.exp(log_m[:-1, :-1])
+        weights = m.sum(axis=1)
+        partners = m @ target / (weights[:, None] + 1e-5)
         a, b = (np.average(points, axis=0, weights=weights) for points in (xyz, partners))
         turn, _ = Rotation.align_vectors(partners - b, xyz - a, weights=weights)
         rotation, translation = turn.as_matrix(), b - turn.as_matrix() @ a
         results.append(
-            {"rotation": rotation, "translation": translation, "log_assignment": log_p[:-1, :-1]}
+            {"rotation": rotation, "translation": translation, "log_assignment": log_m[:-1, :-1]}
             | {"weights": weights, "partners": partners, "alpha": alpha, "beta": beta}
         )
     return results
 
 
+def plain(variables: dict, source: PointCloud, target: PointCloud, pose: RigidTransform) -> Match:
+    return MODEL.apply(variables, source, target, pose, method="match")
+
+
+def fast(variables: dict, source: PointCloud, target: PointCloud, pose: RigidTransform) -> Match:
+    near = fast_rpmnet.neighborhoods(MODEL, source)
+    features = fast_rpmnet.features(MODEL, variables, target)
+    return fast_rpmnet.match(MODEL, variables, source, near, target, features, pose)
+
+
 @functools.cache
-def slow_answer(iterations: int = 2) -> list[dict]:
-    xyz, normals, target_xyz, target_normals = problem()
-    target = (target_xyz, target_normals)
-    return slow_rpmnet((xyz, normals), target, state_dict(), MODEL, iterations)
+def iterations(form) -> list[tuple[Match, tuple]]:
+    """In float64, two of them: the match, and the gradients for weights, source and target."""
 
+    def total(variables, source_xyz, target_xyz, source, target, pose):
+        moved, fixed = source.replace(xyz=source_xyz), target.replace(xyz=target_xyz)
+        match = form(variables, moved, fixed, pose)
+        pose = jnp.sum(match.target_from_source.as_matrix() ** 3)
+        return pose + jnp.sum(jnp.exp(match.log_assignment) ** 2), match
 
-def assert_matches(found, expected: list[dict], rows=slice(None), columns=slice(None)) -> None:
-    for match, want in zip(found, expected, strict=True):
-        motion = match.target_from_source
-        np.testing.assert_allclose(motion.rotation, want["rotation"], atol=EXACT)
-        np.testing.assert_allclose(motion.translation, want["translation"], atol=EXACT)
-        np.testing.assert_allclose(match.weights[rows], want["weights"], atol=EXACT)
-        np.testing.assert_allclose(match.partners[rows], want["partners"], atol=EXACT)
-        log_assignment = match.log_assignment[rows][:, columns]
-        np.testing.assert_allclose(log_assignment, want["log_assignment"], atol=100 * EXACT)
-        np.testing.assert_allclose((match.alpha, match.beta), (want["alpha"], want["beta"]), EXACT)
-
-
-@pytest.fixture
-def _double():
+    # XLA without optimisation loses gradients of `jnp.max`, which the fast form does without
+    jit = quick_jit if form is fast else jax.jit
     with jax.enable_x64(True):
-        yield
+        step = jit(jax.grad(total, (0, 1, 2), has_aux=True))
+        source, target = clouds(np.float64)
+        pose, results = RigidTransform.identity(dtype=np.float64), []
+        for _ in range(2):
+            gradient, match = step(
+                variables(np.float64), source.xyz, target.xyz, source, target, pose
+            )
+            results.append(jax.tree.map(np.asarray, (match, gradient)))
+            pose = results[-1][0].target_from_source
+    return results
 
 
-@pytest.mark.usefixtures("_double")
-def test_it_is_the_slow_twin_on_other_inputs_and_another_k():
-    """Padded, while the twin knows no padding: any amount of it changes nothing."""
-    xyz, normals, target_xyz, target_normals = problem()
-    source = cloud(xyz, normals, N + 17, seed=1)
-    target = cloud(target_xyz, target_normals, M + 30, seed=2)
-    found = run(MODEL, exact_variables(), source, target)
-    assert_matches(found, slow_answer(), source.mask, target.mask)
-    for match in found:
-        np.testing.assert_array_equal(match.weights[~source.mask], 0)
+def test_the_plain_form_is_the_numpy_twin():
+    """Padded, while the twin knows no padding: padding changes nothing."""
+    rows, columns = (points.mask for points in clouds())
+    for (match, _), expected in zip(iterations(plain), twin_matches(), strict=True):
+        pose = match.target_from_source
+        np.testing.assert_allclose(pose.rotation, expected["rotation"], atol=EXACT)
+        np.testing.assert_allclose(pose.translation, expected["translation"], atol=EXACT)
+        np.testing.assert_allclose(match.weights[rows], expected["weights"], atol=EXACT)
+        np.testing.assert_allclose(match.partners[rows], expected["partners"], atol=EXACT)
+        log_assignment = match.log_assignment[rows][:, columns]
+        np.testing.assert_allclose(log_assignment, expected["log_assignment"], atol=100 * EXACT)
+        np.testing.assert_allclose(match.alpha, expected["alpha"], rtol=EXACT)
+        np.testing.assert_allclose(match.beta, expected["beta"], rtol=EXACT)
+        np.testing.assert_array_equal(match.weights[~rows], 0)
     # the problem is one in which something happens: some points match, some go to the slack
-    assert np.ptp(slow_answer()[0]["weights"]) > 0.5
-    gap = found[1].target_from_source.as_matrix() - found[0].target_from_source.as_matrix()
-    assert np.abs(gap).max() > 1e-3
+    first, second = twin_matches()
+    assert np.ptp(first["weights"]) > 0.5
+    assert np.abs(second["rotation"] - first["rotation"]).max() > 1e-3
 
 
-@pytest.mark.usefixtures("_double")
-def test_order_of_points_does_not_matter_where_every_neighbour_fits():
-    """With K >= N; below it, the first K by index are other points after a permutation."""
-    xyz, normals, target_xyz, target_normals = problem()
-    rng = np.random.default_rng(0)
-    rows, columns = rng.permutation(N), rng.permutation(M)
-    variables = exact_variables()
-    plain = run(WIDE, variables, cloud(xyz, normals), cloud(target_xyz, target_normals), 1)
-    mixed = run(
-        WIDE,
-        variables,
-        cloud(xyz[rows], normals[rows]),
-        cloud(target_xyz[columns], target_normals[columns]),
-        1,
-    )
-    expected = [
-        {
-            "rotation": match.target_from_source.rotation,
-            "translation": match.target_from_source.translation,
-            "weights": match.weights[rows],
-            "partners": match.partners[rows],
-            "log_assignment": match.log_assignment[rows][:, columns],
-            "alpha": match.alpha,
-            "beta": match.beta,
-        }
-        for match in plain
-    ]
-    assert_matches(mixed, expected)
+def test_the_fast_form_is_the_plain_one():
+    """Outputs of every iteration and gradients, in float64, padding masked."""
+    rows, columns = (points.mask for points in clouds())
+    for (match, slopes), (plain_match, plain_slopes) in zip(
+        iterations(fast), iterations(plain), strict=True
+    ):
+        log_assignment, expected = (
+            m.log_assignment[rows][:, columns] for m in (match, plain_match)
+        )
+        np.testing.assert_allclose(log_assignment, expected, atol=100 * EXACT)  # of about 100
+        found, expected = (
+            (m.target_from_source, m.partners[rows], m.weights, m.alpha, m.beta)
+            for m in (match, plain_match)
+        )
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=EXACT), found, expected)
+        # slopes of up to 10
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, atol=10 * EXACT), slopes, plain_slopes
+        )
+        to_weights, *to_clouds = slopes
+        assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(to_weights))
+        for slope, mask in zip(to_clouds, (rows, columns), strict=True):
+            np.testing.assert_array_equal(slope[~mask], 0)
+            assert np.abs(slope[mask]).max(axis=1).min() > 0
 
 
-@pytest.mark.usefixtures("_double")
-def test_shared_reference_features_and_a_start_elsewhere():
-    xyz, normals, target_xyz, target_normals = problem()
-    source, target = cloud(xyz, normals), cloud(target_xyz, target_normals)
-    shared = features(MODEL, exact_variables(), target)
-    expected = slow_features(target_xyz, target_normals, state_dict(), K, MODEL.radius)
-    np.testing.assert_allclose(shared, expected, atol=EXACT)
-    # started at the first iteration's pose, the first iteration is the second of the other run
-    first = jax.tree.map(np.asarray, slow_answer()[0])
-    start = RigidTransform(first["rotation"], first["translation"])
-    resume = jax.jit(functools.partial(MODEL.apply, exact_variables()), static_argnums=3)
-    assert_matches(resume(source, target, start, 1, shared), slow_answer()[1:])
+def test_a_call_gives_all_iterations():
+    with jax.enable_x64(True):
+        init = RigidTransform.identity(dtype=np.float64)
+        call = quick_jit(MODEL.apply, static_argnums=4)
+        found = call(variables(np.float64), *clouds(np.float64), init, 2)
+    for match, (expected, _) in zip(found, iterations(plain), strict=True):
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, atol=100 * EXACT), match, expected
+        )
 
 
-def test_the_last_match_is_the_last_of_all():
-    xyz, normals, target_xyz, target_normals = single(*problem())
-    source, target = cloud(xyz, normals, N + 5), cloud(target_xyz, target_normals)
-    variables, init = random_variables(), RigidTransform.identity()
-    expected = run(MODEL, variables, source, target, 3)[-1]
-    last = jax.jit(functools.partial(last_match, MODEL, iterations=3))
-    found = last(variables, source, target, init)
-    shared = last(
-        variables,
+def test_both_forms_have_the_published_parameters():
+    source, target = clouds()
+    made = jax.eval_shape(
+        lambda *args: RpmNet().init(*args, 1),
+        jax.random.key(0),
         source,
         target,
-        init,
-        near=jax.jit(functools.partial(MODEL.apply, method="neighborhoods"))(variables, source),
-        target_features=features(MODEL, variables, target),
+        RigidTransform.identity(),
     )
-    for match in (found, shared):
-        for a, b in zip(jax.tree.leaves(match), jax.tree.leaves(expected), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)  # f32 eps x the condition
+    assert sum(leaf.size for leaf in jax.tree.leaves(made)) == 905_154
+    assert jax.tree.map(np.shape, variables()) == jax.tree.map(lambda leaf: leaf.shape, made)
+    # flax refuses parameters of another shape, in the fast form too
+    jax.eval_shape(fast, made, source, target, RigidTransform.identity())
 
 
-# ---- the contract ----
+@pytest.mark.skipif(
+    not (PARITY / "rpmnet_io.npz").exists(), reason="needs ../shared/parity/rpmnet_*.npz"
+)
+@pytest.mark.parametrize(
+    ("form", "pairs"),
+    [("fast", (0,)), pytest.param("fast", (1, 2), marks=pytest.mark.slow),
+     pytest.param("plain", (0,), marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_parity_with_the_published_code(form, pairs):
+    with np.load(PARITY / "rpmnet_io.npz") as file:
+        io = dict(file)
+    model = RpmNet(
+        num_neighbors=int(io["num_neighbors"]),
+        radius=float(io["radius"]),
+        sinkhorn_iterations=int(io["num_sinkhorn_iterations"]),
+    )
+    weights = rpmnet_variables(load_state_dict(PARITY / "rpmnet_weights.npz"))
 
-REGISTER = rpmnet(MODEL, random_variables(), iterations=1)
-jitted = jax.jit(REGISTER)
+    @jax.jit
+    def step(source, near, target, features, pose):
+        if form == "plain":
+            return model.apply(weights, source, target, pose, method="match")
+        return fast_rpmnet.match(model, weights, source, near, target, features, pose)
+
+    @jax.jit
+    def of_cloud(points):
+        features = fast_rpmnet.features(model, weights, points)
+        return fast_rpmnet.neighborhoods(model, points), features
+
+    for pair in pairs:
+        source, target = (
+            PointCloud(p[:, :3], p[:, 3:], np.ones(len(p), bool))
+            for p in (io["points_src"][pair], io["points_ref"][pair])
+        )
+        (near, source_features), (_, features) = of_cloud(source), of_cloud(target)
+        pose = RigidTransform.identity()
+        for index in range(5):
+            match = step(source, near, target, features, pose)
+            pose = match.target_from_source
+            expected = io["transforms"][index, pair]
+            np.testing.assert_allclose(pose.as_matrix()[:3], expected, atol=1e-4)
+            np.testing.assert_allclose(match.alpha, io["alpha"][index, pair], rtol=1e-3)
+            np.testing.assert_allclose(match.beta, io["beta"][index, pair], rtol=1e-4)
+            for axis, name in ((1, "src_weights"), (0, "ref_weights")):
+                sums = np.exp(match.log_assignment).sum(axis)
+                # of the one point that has a neighbour on the rim of the ball; see below
+                np.testing.assert_allclose(sums, io[name][index, pair], atol=4e-3)
+            if index == 0:
+                np.testing.assert_allclose(match.partners, io["weighted_ref_0"][pair], atol=2e-3)
+        for name, found in (("feat_ref", features), ("feat_src_0", source_features)):
+            # one neighbour on the rim of the ball, in by one rounding and out by another, moves
+            # the features of its point; all others agree to f32 eps x 100
+            gap = np.abs(found - io[name][pair]).max(axis=1)
+            assert np.mean(gap > 2e-5) < 0.01
+            assert gap.max() < 0.05
 
 
-def single(*arrays: np.ndarray) -> list[np.ndarray]:
-    return [array.astype(np.float32) for array in arrays]
+# ---- the method
 
 
-def starts(count: int) -> RigidTransform:
-    rng = np.random.default_rng(0)
-    rotation = Rotation.random(count, rng=rng).as_matrix().astype(np.float32)
-    return RigidTransform(rotation, rng.normal(size=(count, 3), scale=0.1).astype(np.float32))
+@functools.cache
+def registered():
+    return quick_jit(fast_rpmnet.rpmnet(MODEL, variables(), iterations=1))
 
 
-def test_register_under_vmap_is_the_loop():
-    xyz, normals, target_xyz, target_normals = single(*problem())
-    sizes = (N, N - 7, 12)
-    sources = [cloud(xyz[:size], normals[:size], N) for size in sizes]
-    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *sources)
-    target = cloud(target_xyz, target_normals)
-    inits, keys = starts(3), jax.random.split(jax.random.key(0), 3)
-    batched = jax.jit(jax.vmap(REGISTER, in_axes=(0, None, 0, 0)))(batch, target, inits, keys)
-    for index in range(3):
-        init = jax.tree.map(lambda leaf, index=index: leaf[index], inits)
-        one = jitted(sources[index], target, init, keys[index])
-        assert one.converged.shape == one.rmse.shape == one.overlap.shape == ()
-        assert one.iterations == 1
-        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(batched), strict=True):
-            np.testing.assert_allclose(a, b[index], atol=1e-4)  # f32 eps x the condition of 1e3
+KEY = jax.random.key(0)
 
 
 def test_registration_says_what_it_rests_on():
-    xyz, normals, target_xyz, target_normals = single(*problem())
-    source, target = cloud(xyz, normals), cloud(target_xyz, target_normals)
-    init, key = RigidTransform.identity(), jax.random.key(0)
-    result = jitted(source, target, init, key)
-    want = slow_answer()[0]
-    moved = problem()[0] @ want["rotation"].T + want["translation"]
-    squared = np.sum((moved - want["partners"]) ** 2, -1)
-    expected = np.sqrt(np.average(squared, weights=want["weights"]))
-    np.testing.assert_allclose(result.rmse, expected, rtol=1e-3)  # f32 eps x condition
-    np.testing.assert_allclose(result.overlap, want["weights"].mean(), rtol=1e-3)
+    result = registered()(*clouds(), RigidTransform.identity(), KEY)
+    expected = twin_matches()[0]
+    moved = problem()[0] @ expected["rotation"].T + expected["translation"]
+    squared = np.sum((moved - expected["partners"]) ** 2, -1)
+    rmse = np.sqrt(np.average(squared, weights=expected["weights"]))
+    np.testing.assert_allclose(result.rmse, rmse, rtol=1e-3)  # f32 eps x condition
+    np.testing.assert_allclose(result.overlap, expected["weights"].mean(), rtol=1e-3)
     assert result.converged
+    assert result.iterations == 1
+
+
+def test_the_last_match_is_the_last_of_all_and_shares_what_it_is_given():
+    source, target = clouds()
+
+    @quick_jit
+    def last(variables, source, target):
+        shared = {
+            "near": fast_rpmnet.neighborhoods(MODEL, source),
+            "target_features": fast_rpmnet.features(MODEL, variables, target),
+        }
+        init = RigidTransform.identity()
+        return fast_rpmnet.last_match(
+            MODEL, variables, source, target, init, iterations=2, **shared
+        )
+
+    found = last(variables(), source, target).target_from_source
+    expected = twin_matches()[1]
+    # f32 eps x the condition of 1e3
+    np.testing.assert_allclose(found.rotation, expected["rotation"], atol=1e-3)
+    np.testing.assert_allclose(found.translation, expected["translation"], atol=1e-3)
 
 
 @pytest.mark.parametrize("case", ["no source", "no target", "nothing", "one point", "coincident"])
 def test_degenerate_clouds_give_an_answer_without_nan(case):
-    xyz, normals, target_xyz, target_normals = single(*problem())
-    source, target = cloud(xyz, normals), cloud(target_xyz, target_normals)
+    source, target = clouds()
     if case in ("no source", "nothing"):
-        source = source.replace(mask=np.zeros(N, bool))
+        source = source.replace(mask=np.zeros_like(source.mask))
     if case in ("no target", "nothing"):
-        target = target.replace(mask=np.zeros(M, bool))
+        target = target.replace(mask=np.zeros_like(target.mask))
     if case == "one point":
-        source = source.replace(mask=np.arange(N) == 3)
+        source = source.replace(mask=np.cumsum(source.mask) == 3)
     if case == "coincident":
-        source = source.replace(xyz=0 * xyz)
-    result = jitted(source, target, RigidTransform.identity(), jax.random.key(0))
+        source = source.replace(xyz=0 * source.xyz)
+    result = registered()(source, target, RigidTransform.identity(), KEY)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(result))
     rotation = result.target_from_source.rotation
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=2e-6)  # f32 eps x 20
@@ -343,138 +380,23 @@ def test_degenerate_clouds_give_an_answer_without_nan(case):
         assert result.overlap == 0
 
 
-@functools.cache
-def padded_gradient():
-    """Gradients of a pose for the weights and both clouds; one iteration: the next is detached."""
-    xyz, normals, target_xyz, target_normals = single(*problem())
-    source = cloud(xyz, normals, N + 17, seed=1)
-    target = cloud(target_xyz, target_normals, M + 30, seed=2)
-
-    @jax.jit
-    def gradient(variables, source, target):
-        def total(variables, source_xyz, target_xyz):
-            moved, fixed = source.replace(xyz=source_xyz), target.replace(xyz=target_xyz)
-            matches = run(MODEL, variables, moved, fixed, 1)
-            return jnp.sum(matches[-1].target_from_source.as_matrix() ** 3)
-
-        return jax.grad(total, (0, 1, 2))(variables, source.xyz, target.xyz)
-
-    return gradient, source, target
-
-
-def test_gradients_reach_every_weight_and_point_but_no_padding():
-    gradient, source, target = padded_gradient()
-    to_variables, *to_clouds = gradient(random_variables(), source, target)
-    assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(to_variables))
-    for found, mask in zip(to_clouds, (source.mask, target.mask), strict=True):
-        np.testing.assert_array_equal(found[~mask], 0)
-        assert np.abs(found[mask]).max(axis=1).min() > 0
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [(1, 1, 0), (1, 0, 0), (0, 0, 0)])
 def test_gradients_stay_finite_on_a_plane_a_line_and_a_point(axes):
-    gradient, source, target = padded_gradient()
+    source, target = clouds()
     flat = source.replace(
         xyz=source.xyz * np.float32(axes),
         normals=np.broadcast_to(np.float32([0, 0, 1]), source.xyz.shape),
     )
-    found = gradient(random_variables(), flat, target)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
-
-
-# ---- import, and parity with the published code ----
-
-
-def test_it_has_the_published_number_of_parameters():
-    xyz, normals, *_ = single(*problem())
-    points = cloud(xyz, normals)
-    made = jax.eval_shape(
-        lambda *args: RpmNet().init(*args, 1),
-        jax.random.key(0),
-        points,
-        points,
-        RigidTransform.identity(),
-    )
-    assert sum(leaf.size for leaf in jax.tree.leaves(made)) == 905_154
-    imported = random_variables()
-    assert jax.tree.structure(imported) == jax.tree.structure(made)
-    assert jax.tree.map(np.shape, imported) == jax.tree.map(lambda leaf: leaf.shape, made)
-    assert {leaf.dtype for leaf in jax.tree.leaves(imported)} == {np.dtype(np.float32)}
-
-
-def test_import_from_a_file(tmp_path):
-    np.savez(tmp_path / "weights.npz", **state_dict())
-    variables = rpmnet_variables(load_state_dict(tmp_path / "weights.npz"))
-    jax.tree.map(np.testing.assert_array_equal, variables, random_variables())
-
-
-BIAS = "feat_extractor.prepool.3.bias"
-KERNEL = "feat_extractor.prepool.3.weight"
-FIRST = "feat_extractor.prepool.0.weight"
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({BIAS: None}, BIAS),
-        ({"weights_net.postpool.4.weight": None}, "weights_net.postpool.4.weight"),
-        ({"classifier.weight": np.zeros(3)}, "classifier.weight"),
-        ({FIRST: np.zeros((10, 96, 1, 1))}, FIRST),  # transposed
-        ({KERNEL: np.zeros((96, 10, 1, 1))}, KERNEL),
-        ({KERNEL: np.zeros((96, 96, 3, 3))}, KERNEL),
-        ({KERNEL: np.zeros(96)}, KERNEL),
-        ({BIAS: np.zeros(95)}, BIAS),
-        ({BIAS: np.zeros(())}, BIAS),
-        ({BIAS: np.full(96, np.nan)}, BIAS),
-    ],
-)
-def test_import_refuses_another_model_and_names_what_differs(changes, words):
-    state = {name: value for name, value in (state_dict() | changes).items() if value is not None}
-    with pytest.raises(InputError, match=words.replace(".", r"\.")):
-        rpmnet_variables(state)
-
-
-needs_parity = pytest.mark.skipif(
-    not (PARITY / "rpmnet_io.npz").exists(), reason="needs ../shared/parity/rpmnet_*.npz"
-)
+    gradient = float32_gradient()(variables(), flat.xyz, flat, target)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
 @functools.cache
-def published() -> tuple[dict[str, np.ndarray], RpmNet, dict]:
-    with np.load(PARITY / "rpmnet_io.npz") as file:
-        io = dict(file)
-    model = RpmNet(
-        num_neighbors=int(io["num_neighbors"]),
-        radius=float(io["radius"]),
-        sinkhorn_iterations=int(io["num_sinkhorn_iterations"]),
-    )
-    return io, model, rpmnet_variables(load_state_dict(PARITY / "rpmnet_weights.npz"))
+def float32_gradient():
+    def total(variables, xyz, source, target):
+        init = RigidTransform.identity()
+        match = fast(variables, source.replace(xyz=xyz), target, init)
+        return jnp.sum(match.target_from_source.as_matrix() ** 3)
 
-
-@needs_parity
-@pytest.mark.parametrize("pair", range(3))
-def test_parity_with_the_published_code(pair):
-    io, model, variables = published()
-    source, target = (
-        cloud(points[:, :3], points[:, 3:])
-        for points in (io["points_src"][pair], io["points_ref"][pair])
-    )
-    matches = run(model, variables, source, target, iterations=5)
-    for step, match in enumerate(matches):
-        found = match.target_from_source.as_matrix()[:3]
-        np.testing.assert_allclose(found, io["transforms"][step, pair], atol=1e-4)
-        np.testing.assert_allclose(match.alpha, io["alpha"][step, pair], rtol=1e-3)
-        np.testing.assert_allclose(match.beta, io["beta"][step, pair], rtol=1e-4)
-        for axis, name in ((1, "src_weights"), (0, "ref_weights")):
-            sums = np.exp(match.log_assignment).sum(axis)
-            # of the one point that has a neighbour on the rim of the ball; see below
-            np.testing.assert_allclose(sums, io[name][step, pair], atol=4e-3)
-    partners = io["weighted_ref_0"][pair]
-    np.testing.assert_allclose(matches[0].partners, partners, atol=2e-3)
-    for name, points in (("feat_ref", target), ("feat_src_0", source)):
-        found = features(model, variables, points)
-        # one neighbour on the rim of the ball, in by one rounding and out by another, moves
-        # the features of its point; all others agree to f32 eps x 100
-        gap = np.abs(found - io[name][pair]).max(axis=1)
-        assert np.mean(gap > 2e-5) < 0.01
-        assert gap.max() < 0.05
+    return quick_jit(jax.grad(total, (0, 1)))

@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vanejax.localization.fine_registration import subset
-from vanejax.matching.rpmnet import RpmNet, last_match
+from vanejax.matching.fast_rpmnet import features, last_match, neighborhoods
+from vanejax.matching.rpmnet import RpmNet
 from vanejax.pointcloud import PointCloud, voxel_thin
 from vanejax.rigid import RigidTransform
 from vanejax.scans.measured_scan import MeasuredScan
@@ -96,8 +97,8 @@ def _follow(
 
     What does not change with the pose is computed once for all.
     """
-    near = model.apply(variables, source, method=RpmNet.neighborhoods)
-    features = model.apply(variables, target, method=RpmNet.features)
+    near = neighborhoods(model, source)
+    target_features = features(model, variables, target)
 
     def one(init: RigidTransform) -> RigidTransform:
         return last_match(
@@ -108,7 +109,7 @@ def _follow(
             init,
             iterations=iterations,
             near=near,
-            target_features=features,
+            target_features=target_features,
         ).target_from_source
 
     return jax.lax.map(one, inits, batch_size=at_once)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
@@ -41,7 +43,7 @@ class Register(Protocol):
         ...
 
 
-def in_turn(coarse: Register, fine: Register) -> Register:
+def chain(coarse: Register, fine: Register) -> Register:
     """``fine`` starting where ``coarse`` ended; iterations add up, the rest is the second's."""
 
     def register(
@@ -53,3 +55,26 @@ def in_turn(coarse: Register, fine: Register) -> Register:
         return second.replace(iterations=first.iterations + second.iterations)
 
     return register
+
+
+Iteration = TypeVar("Iteration", bound=Any)  # a flax dataclass with ``target_from_source``
+
+
+def last_iteration(
+    iterate: Callable[[RigidTransform], Iteration], init: RigidTransform, *, iterations: int
+) -> Iteration:
+    """The last of several iterations, each from the ``target_from_source`` of the one before.
+
+    A loop, not as many copies of the network to compile.
+
+    Args:
+      iterate: one iteration from a target_from_source.
+      init: the pose to start from.
+      iterations: static, at least 1.
+    """
+    start = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(iterate, init)
+    )
+    start = start.replace(target_from_source=jax.tree.map(jnp.asarray, init))
+    step = lambda before, _: (iterate(before.target_from_source), None)  # noqa: E731
+    return jax.lax.scan(step, start, length=iterations)[0]

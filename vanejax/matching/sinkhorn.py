@@ -1,4 +1,4 @@
-"""Soft matching: from feature distances to a partial assignment between two clouds."""
+"""Sinkhorn: from the affinity of all pairs to a soft assignment between two clouds."""
 
 from __future__ import annotations
 
@@ -9,16 +9,13 @@ import jax.numpy as jnp
 _ROUNDS = 5
 
 
-def log_sinkhorn(
+def sinkhorn(
     affinity: jax.Array, source_mask: jax.Array, target_mask: jax.Array, *, iterations: int
 ) -> jax.Array:
-    """Alternating normalisation of rows and columns in the log domain, with slack.
+    """Alternating normalisation of the rows and the columns of ``exp(affinity)``, with slack.
 
-    A slack row and a slack column of affinity 0 take up the points that have no partner; the
-    slack itself is never normalised (RPM-Net, section 4.1; Sinkhorn, 1964). In the log domain that
-    is ``u_i = log(1 + sum_j exp(A_ij - v_j))``, ``v_j = log(1 + sum_i exp(A_ij - u_i))``, with
-    ``A - u - v`` as the answer, and costs N x M exponentials for each sum. Here they are taken once
-    for several rounds, as ``E = exp(A - u - v)``, and a sum is the product of E with a vector.
+    A slack row and a slack column of affinity 0 take up the points that have no partner; the slack
+    itself is never normalised. In logarithms, as published (RPM-Net; Sinkhorn, 1964).
 
     Args:
       affinity: [N, M] f32, larger for better partners.
@@ -30,9 +27,27 @@ def log_sinkhorn(
       log assignment [N, M] f32. Its exponential has rows and columns that sum to at most 1. At
       padding it is finite and very negative, its exponential exactly zero.
     """
-    real = source_mask[:, None] & target_mask[None, :]
     # exp(-1e9) is exactly 0 in f32, and unlike -inf it never makes a NaN in a gradient.
-    affinity = jnp.where(real, affinity, -1e9)
+    affinity = jnp.where(source_mask[:, None] & target_mask[None, :], affinity, -1e9)
+    log_m = jnp.pad(affinity, ((0, 1), (0, 1)))
+    for _ in range(iterations):
+        rows = log_m[:-1]
+        log_m = log_m.at[:-1].set(rows - jax.nn.logsumexp(rows, axis=1, keepdims=True))
+        columns = log_m[:, :-1]
+        log_m = log_m.at[:, :-1].set(columns - jax.nn.logsumexp(columns, axis=0, keepdims=True))
+    return log_m[:-1, :-1]
+
+
+def log_sinkhorn(
+    affinity: jax.Array, source_mask: jax.Array, target_mask: jax.Array, *, iterations: int
+) -> jax.Array:
+    """`sinkhorn`, with N x M exponentials once for several rounds instead of twice for each.
+
+    In logarithms the rounds are ``u_i = log(1 + sum_j exp(A_ij - v_j))`` and
+    ``v_j = log(1 + sum_i exp(A_ij - u_i))``, with ``A - u - v`` as the answer. Here
+    ``E = exp(A - u - v)`` is taken now and then, and a sum is the product of E with a vector.
+    """
+    affinity = jnp.where(source_mask[:, None] & target_mask[None, :], affinity, -1e9)
     # The largest entry of each row becomes 1: what underflows is nothing beside the slack.
     u = jax.lax.stop_gradient(jnp.maximum(jnp.max(affinity, axis=1), 0.0))
     v = jnp.zeros_like(affinity[0])

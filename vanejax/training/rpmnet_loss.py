@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from vanejax.matching import fast_rpmnet
 from vanejax.matching.metrics import pose_metrics
 from vanejax.matching.rpmnet import Match, RpmNet
 from vanejax.pointcloud import PointCloud
@@ -65,21 +66,21 @@ class RpmNetLoss:
         Metrics: each part of the loss and the pose error, all after the last iteration.
         """
         # Once for the batch: the reference is the same for every view.
-        features = model.apply(variables, pairs.target, method="features")
+        features = fast_rpmnet.features(model, variables, pairs.target)
         weights = self.discount ** jnp.arange(self.iterations - 1.0, -1.0, -1.0)
 
         def of_pair(
             shared: tuple[Variables, jax.Array], source: PointCloud, truth: RigidTransform
         ) -> tuple[jax.Array, Metrics]:
             pair = Pair(source=source, target=pairs.target, target_from_source=truth)
-            near = model.apply(variables, source, method="neighborhoods")
+            near = fast_rpmnet.neighborhoods(model, source)
 
             def iteration(
                 shared: tuple[Variables, jax.Array], pose: RigidTransform, weight: jax.Array
             ) -> tuple[jax.Array, RigidTransform, Metrics]:
                 variables, features = shared
-                match = model.apply(
-                    variables, source, near, pair.target, features, pose, method="match"
+                match = fast_rpmnet.match(
+                    model, variables, source, near, pair.target, features, pose
                 )
                 value, parts = self.of_match(match, source, pair)
                 pose = match.target_from_source

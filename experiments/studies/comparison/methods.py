@@ -14,7 +14,7 @@ from experiments.studies.comparison.settings import NETWORKS, Comparison, IcpSet
 from vanejax.matching.baselines.fgr import fgr
 from vanejax.matching.baselines.icp import icp
 from vanejax.matching.baselines.sac_ia import sac_ia
-from vanejax.matching.contract import Register, in_turn
+from vanejax.matching.contract import Register, chain
 
 TITLES = {
     "icp": "ICP",
@@ -81,11 +81,11 @@ def make_method(name: str, config: Comparison, network: Trained | None = None) -
         "icp": lambda: jax.jit(icp(**_icp_fields(config.icp))),
         "sac_ia": lambda: jax.jit(sac_ia(**_fields(config.sac_ia))),
         "sac_ia_icp": lambda: jax.jit(
-            in_turn(sac_ia(**_fields(config.sac_ia)), icp(**_icp_fields(config.fine_icp)))
+            chain(sac_ia(**_fields(config.sac_ia)), icp(**_icp_fields(config.fine_icp)))
         ),
         "fgr": lambda: jax.jit(fgr(**_fields(config.fgr))),
         "open3d_icp": lambda: open3d_methods.icp(**_icp_fields(config.open3d_icp)),
-        "open3d_ransac_icp": lambda: in_turn(
+        "open3d_ransac_icp": lambda: chain(
             open3d_methods.ransac(**_fields(config.open3d_ransac)),
             open3d_methods.icp(**_icp_fields(config.open3d_fine_icp)),
         ),

@@ -22,9 +22,10 @@ from vanejax.matching.baselines.icp import icp
 from vanejax.matching.baselines.pcrnet import PcrNet, pcrnet
 from vanejax.matching.baselines.pointnetlk import PointNetLK, pointnetlk
 from vanejax.matching.baselines.sac_ia import sac_ia
-from vanejax.matching.contract import Register, Registration, in_turn
+from vanejax.matching.contract import Register, Registration, chain
+from vanejax.matching.fast_rpmnet import rpmnet
 from vanejax.matching.metrics import rotation_error_deg
-from vanejax.matching.rpmnet import RpmNet, rpmnet
+from vanejax.matching.rpmnet import RpmNet
 from vanejax.matching.se3 import exp_se3
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
@@ -98,7 +99,7 @@ CASES = {
         8.0,
     ),
     "SAC-IA": Case(coarse, 45.0, drawn=True),
-    "SAC-IA + ICP": Case(lambda: in_turn(coarse(), icp(max_distance=0.1)), 45.0, drawn=True),
+    "SAC-IA + ICP": Case(lambda: chain(coarse(), icp(max_distance=0.1)), 45.0, drawn=True),
     "FGR": Case(lambda: fgr(feature_radius=0.5, max_distance=0.05), 45.0, drawn=True),
     "RPM-Net": Case(
         network(RpmNet(num_neighbors=8, radius=0.4, feature_width=16), rpmnet, iterations=2)

@@ -20,8 +20,7 @@ import jax.numpy as jnp
 from vanejax.errors import InputError
 from vanejax.matching.baselines.dgcnn import Dgcnn
 from vanejax.matching.baselines.transformer import Encoded, Transformer
-from vanejax.matching.contract import Register, Registration
-from vanejax.matching.iteration import last_iteration
+from vanejax.matching.contract import Register, Registration, last_iteration
 from vanejax.matching.procrustes import weighted_procrustes
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform

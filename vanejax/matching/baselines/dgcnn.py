@@ -4,8 +4,8 @@ DCP's published code builds the graph once, from coordinates, and keeps it for a
 original DGCNN builds it anew from the features of each layer. Each edge carries the neighbour's
 and the point's own coordinates, not their difference. Published convolutions have no bias and are
 followed by batch normalisation; here it is group normalisation over the real points of one cloud
-(`vanejax.matching.layers`), for which a bias is no redundancy: it has one. A cloud's features then
-depend on neither the batch nor a running average.
+(`vanejax.matching.fused_layers`), for which a bias is no redundancy: it has one. A cloud's features
+then depend on neither the batch nor a running average.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from vanejax.matching.layers import (
+from vanejax.matching.fused_layers import (
     DenseNormRelu,
     DenseNormReluMax,
     GroupNorm,

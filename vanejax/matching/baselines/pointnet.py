@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from vanejax.matching.contract import Registration
-from vanejax.matching.layers import cloud_max, product
+from vanejax.matching.fused_layers import cloud_max, product
 from vanejax.pointcloud import PointCloud, squared_distances
 from vanejax.rigid import RigidTransform
 

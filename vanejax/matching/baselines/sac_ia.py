@@ -92,17 +92,17 @@ def sac_ia(
             triangles.agrees.astype(jnp.int32), min(num_scored, num_hypotheses)
         )
         poses = _poses_of(matches, triangles.rows[first], source, target)
-        score = _in_turn(lambda pose: jnp.sum(_closeness(pose, source, surface)), poses)
+        score = _in_batches(lambda pose: jnp.sum(_closeness(pose, source, surface)), poses)
         _, best = jax.lax.top_k(jnp.where(found > 0, score, -1.0), min(num_refined, *score.shape))
         poses, found = jax.tree.map(lambda leaf: leaf[best], (poses, found > 0))
         poses = jax.lax.fori_loop(
             0,
             refinements,
-            lambda _, poses: _in_turn(lambda pose: _refined(pose, source, surface), poses),
+            lambda _, poses: _in_batches(lambda pose: _refined(pose, source, surface), poses),
             poses,
         )
         finite = jnp.all(jnp.isfinite(poses.as_matrix()), (-1, -2))
-        closeness = _in_turn(lambda pose: _closeness(pose, source, surface), poses)
+        closeness = _in_batches(lambda pose: _closeness(pose, source, surface), poses)
         score = jnp.where(found & finite, jnp.sum(closeness, -1), -1.0)
         winner = jnp.argmax(score)
         converged = (score[winner] > 0) & (jnp.sum(closeness[winner] > 0) >= 3)
@@ -224,6 +224,6 @@ def _refined(pose: RigidTransform, source: PointCloud, surface: _Surface) -> Rig
     return RigidTransform(rotation=rotation, translation=shift) @ pose
 
 
-def _in_turn(function: Callable[[RigidTransform], T], poses: RigidTransform) -> T:
+def _in_batches(function: Callable[[RigidTransform], T], poses: RigidTransform) -> T:
     """``function`` of every pose [S], a few at a time: S x N x M distances would be much memory."""
     return jax.lax.map(function, poses, batch_size=_POSES_AT_ONCE)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vanejax.matching.contract import Register, Registration, in_turn
+from vanejax.matching.contract import Register, Registration, chain
 from vanejax.matching.se3 import exp_se3
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
@@ -32,7 +32,7 @@ def step(twist: list[float], iterations: int, seen: list) -> Register:
 
 def test_the_second_starts_where_the_first_ended() -> None:
     first, second, seen = [0.1, 0.2, 0.0, 1.0, 0.0, 0.0], [0.0, 0.3, 0.0, 0.0, 2.0, 0.0], []
-    register = in_turn(step(first, 1, seen), step(second, 5, seen))
+    register = chain(step(first, 1, seen), step(second, 5, seen))
     init = exp_se3(jnp.array([0.0, 0.0, 0.5, 0.0, 0.0, 3.0]))
     found = register(CLOUD, CLOUD, init, jax.random.key(0))
     total: RigidTransform = exp_se3(jnp.asarray(second)) @ exp_se3(jnp.asarray(first)) @ init

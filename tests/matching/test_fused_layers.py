@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from vanejax.matching.layers import (
+from vanejax.matching.fused_layers import (
     DenseNormRelu,
     DenseNormReluCloudMax,
     DenseNormReluMax,

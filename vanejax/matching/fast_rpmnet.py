@@ -1,0 +1,222 @@
+"""RPM-Net as training and registration run it: the function of `RpmNet`, computed faster.
+
+What does not change is computed once: the reference's features, and the source's neighbours and
+point-pair features, which no rigid motion touches. Layers, normalisation and maxima are fused
+(`vanejax.matching.fused_layers`). All functions take an `RpmNet` for its settings, and its
+variables.
+
+Unlike the plain form it takes clouds without a real point too, and stays finite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from vanejax.matching.contract import Register, Registration, last_iteration
+from vanejax.matching.features import point_pair_features
+from vanejax.matching.fused_layers import (
+    DenseNormRelu,
+    DenseNormReluCloudMax,
+    DenseNormReluMax,
+    GroupNorm,
+    Linear,
+    norm_relu,
+)
+from vanejax.matching.procrustes import weighted_procrustes
+from vanejax.matching.rpmnet import Match, RpmNet
+from vanejax.matching.sinkhorn import log_sinkhorn, soft_correspondences
+from vanejax.pointcloud import PointCloud, ball_query
+from vanejax.rigid import RigidTransform
+
+
+def neighborhoods(model: RpmNet, cloud: PointCloud) -> jax.Array:
+    """Offsets (neighbour minus point) and point-pair features of a cloud [N]: [N, K, 3 + 4].
+
+    No parameters take part, and the point-pair features stay as they are when the cloud moves.
+    """
+    index = ball_query(
+        cloud.xyz, cloud.mask, radius=model.radius, num_neighbors=model.num_neighbors
+    )
+    offsets = cloud.xyz[index] - cloud.xyz[:, None, :]
+    ppf = point_pair_features(offsets, cloud.normals, cloud.normals[index])
+    return jnp.concatenate([offsets, ppf], -1)
+
+
+def features(model: RpmNet, variables: Mapping[str, Any], cloud: PointCloud) -> jax.Array:
+    """Features [M, feature_width] of a cloud: for the reference, once per part."""
+    unturned = jnp.eye(3, dtype=cloud.xyz.dtype)
+    return _features(model, variables, cloud.xyz, neighborhoods(model, cloud), unturned, cloud.mask)
+
+
+def match(
+    model: RpmNet,
+    variables: Mapping[str, Any],
+    source: PointCloud,
+    near: jax.Array,
+    target: PointCloud,
+    target_features: jax.Array,
+    target_from_source: RigidTransform,
+) -> Match:
+    """One iteration from the pose ``target_from_source``.
+
+    Args:
+      model, variables: the network and its weights.
+      source: [N] points.
+      near: [N, K, 7] f32 of the source, from `neighborhoods`.
+      target: [M] points, the reference.
+      target_features: [M, feature_width] f32, from `features`.
+      target_from_source: the pose to start from.
+    """
+    moved = target_from_source.apply(source.xyz)
+    source_features = _features(
+        model, variables, moved, near, target_from_source.rotation, source.mask
+    )
+    both = jnp.concatenate([source.mask, target.mask])
+    beta, alpha = _AnnealingNet().apply(
+        {"params": variables["params"]["annealing_net"]}, moved, target.xyz, both
+    )
+    # Features have unit length: |f - g|^2 = 2 - 2 f.g
+    distances = 2.0 - 2.0 * jnp.matmul(source_features, target_features.T)
+    log_assignment = log_sinkhorn(
+        -beta * (distances - alpha),
+        source.mask,
+        target.mask,
+        iterations=model.sinkhorn_iterations,
+    )
+    partners, weights = soft_correspondences(jnp.exp(log_assignment), target.xyz)
+    return Match(
+        target_from_source=weighted_procrustes(source.xyz, partners, weights),
+        log_assignment=log_assignment,
+        partners=partners,
+        weights=weights,
+        alpha=alpha,
+        beta=beta,
+    )
+
+
+def last_match(
+    model: RpmNet,
+    variables: Mapping[str, Any],
+    source: PointCloud,
+    target: PointCloud,
+    init: RigidTransform,
+    *,
+    iterations: int,
+    near: jax.Array | None = None,
+    target_features: jax.Array | None = None,
+) -> Match:
+    """The last of several iterations, at least 1; see `match`.
+
+    Args:
+      near: [N, K, 7], where several starts share them.
+      target_features: [M, feature_width], where several pairs share them.
+    """
+    near = neighborhoods(model, source) if near is None else near
+    if target_features is None:
+        target_features = features(model, variables, target)
+    return last_iteration(
+        lambda pose: match(model, variables, source, near, target, target_features, pose),
+        init,
+        iterations=iterations,
+    )
+
+
+def rpmnet(model: RpmNet, variables: Mapping[str, Any], *, iterations: int = 5) -> Register:
+    """A trained RPM-Net as a `Register`: source and target in unit-sphere units."""
+
+    def register(
+        source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
+    ) -> Registration:
+        del key  # nothing here is random
+        match = last_match(model, variables, source, target, init, iterations=iterations)
+        residual = match.target_from_source.apply(source.xyz) - match.partners
+        overlap = jnp.sum(match.weights) / jnp.maximum(jnp.sum(source.mask), 1)
+        finite = jnp.all(jnp.isfinite(match.target_from_source.as_matrix()))
+        squared = jnp.sum(match.weights * jnp.sum(residual**2, -1))
+        return Registration(
+            target_from_source=match.target_from_source,
+            converged=finite & (overlap > 1e-3),
+            iterations=jnp.asarray(iterations, jnp.int32),
+            rmse=jnp.sqrt(squared / jnp.maximum(jnp.sum(match.weights), 1e-9)),
+            overlap=overlap,
+        )
+
+    return register
+
+
+def _features(
+    model: RpmNet,
+    variables: Mapping[str, Any],
+    xyz: jax.Array,
+    near: jax.Array,
+    rotation: jax.Array,
+    mask: jax.Array,
+) -> jax.Array:
+    """Features [N, width] of a cloud that was moved after its neighbourhoods were found."""
+    net = _FeatureNet(model.feature_width)
+    return net.apply({"params": variables["params"]["feature_net"]}, xyz, near, rotation, mask)
+
+
+class _NeighborhoodLayer(nn.Module):
+    """`DenseNormRelu` of ``[xyz, turned offset, ppf]``; what is turned is the kernel."""
+
+    features: int
+
+    @nn.compact
+    def __call__(
+        self, xyz: jax.Array, near: jax.Array, rotation: jax.Array, mask: jax.Array
+    ) -> jax.Array:
+        """From xyz [N, 3], near [N, K, 7], rotation [3, 3] and mask [N] to [N, K, features]."""
+        kernel, bias = Linear(self.features, name="dense")(10)
+        exact = jax.lax.Precision.HIGHEST  # as wherever points are turned
+        of_offset = jnp.matmul(rotation.T, kernel[3:6], precision=exact)
+        turned = jnp.concatenate([kernel[:3], of_offset, kernel[6:]])
+        center = jnp.broadcast_to(xyz[:, None, :], (*near.shape[:2], 3))
+        norm = GroupNorm(self.features, num_groups=8, name="norm")
+        return norm_relu(jnp.concatenate([center, near], -1), turned, bias, norm, mask)
+
+
+class _FeatureNet(nn.Module):
+    """`vanejax.matching.rpmnet.FeatureNet` of neighbourhoods that turn with the cloud."""
+
+    width: int
+
+    @nn.compact
+    def __call__(
+        self, xyz: jax.Array, near: jax.Array, rotation: jax.Array, mask: jax.Array
+    ) -> jax.Array:
+        """From xyz [N, 3] as it lies now and near [N, K, 7] as found before it turned."""
+        x = _NeighborhoodLayer(self.width, name="prepool_0")(xyz, near, rotation, mask)
+        x = DenseNormRelu(self.width, name="prepool_1")(x, mask)
+        x = DenseNormReluMax(2 * self.width, name="prepool_2")(x, mask)
+        x = DenseNormRelu(2 * self.width, name="postpool_0")(x, mask)
+        x = DenseNormRelu(self.width, name="postpool_1")(x, mask)
+        x = nn.Dense(self.width, name="postpool_2")(x)
+        # Padding may be exactly zero here; its length is sanitised, never divided by.
+        squared = jnp.sum(x**2, -1, keepdims=True)
+        return x * jax.lax.rsqrt(jnp.maximum(squared, 1e-20))
+
+
+class _AnnealingNet(nn.Module):
+    """`vanejax.matching.rpmnet.AnnealingNet`, the maximum fused with the layer before it."""
+
+    @nn.compact
+    def __call__(
+        self, source: jax.Array, target: jax.Array, mask: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """From source [N, 3], target [M, 3] and mask [N + M] to (beta [], alpha [])."""
+        flags = [jnp.zeros_like(source[:, :1]), jnp.ones_like(target[:, :1])]
+        x = jnp.concatenate([jnp.concatenate([source, target]), jnp.concatenate(flags)], -1)
+        for index, features in enumerate((64, 64, 64, 128)):
+            x = DenseNormRelu(features, name=f"prepool_{index}")(x, mask)
+        x = DenseNormReluCloudMax(1024, num_groups=16, name="prepool_4")(x, mask)[None, :]
+        one = jnp.ones((1,), bool)
+        x = DenseNormRelu(512, num_groups=16, name="postpool_0")(x, one)
+        x = DenseNormRelu(256, num_groups=16, name="postpool_1")(x, one)
+        beta, alpha = nn.softplus(nn.Dense(2, name="postpool_2")(x))[0]
+        return beta, alpha
