@@ -44,7 +44,8 @@ def trained(
       config: the network, and how it is trained.
       part, scans: what for.
       folder: of a run to begin, to go on with, or that is finished.
-      given: the folder of another run, or a file of RPM-Net's weights from PyTorch.
+      given: the folder of another run, or a published RPM-Net's weights, see
+        `load_state_dict`.
 
     Raises:
       InputError: the given folder holds a run of another network, part or kind of data.

@@ -452,7 +452,7 @@ def test_export_says_what_it_wrote(monkeypatch, tmp_path, capsys) -> None:
     monkeypatch.setattr(vanejax.training.export, "export_workdir", export)
     assert main(["export", str(tmp_path), "--checkpoint", "last"]) == 0
     assert capsys.readouterr().out == (
-        f"{tmp_path}/model.npz: RPM-Net for vane (sha256 abababababab), step 40, 2.0 MB\n"
+        f"{tmp_path}/model.safetensors: RPM-Net for vane (sha256 abababababab), step 40, 2.0 MB\n"
     )
 
 

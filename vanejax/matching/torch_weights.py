@@ -1,283 +1,140 @@
-"""Published PyTorch weights as numpy arrays, read without torch and without running the file.
+"""Weights of published PyTorch networks as numpy arrays and as Flax variables.
 
-Nothing in a file is trusted: its pickle is only looked at (``inert_pickle``), and sizes, strides
-and offsets are checked against the bytes that are there.
+A PyTorch file is read by ``torch.load(weights_only=True)``, so nothing in it is run; that needs the
+extra ``vanejax[torch]``. Once converted (`vanejax export FILE.pth --out FILE.safetensors`), the
+weights are read without.
 """
 
 from __future__ import annotations
 
-import io
+import argparse
 import itertools
-import math
 import os
-import pathlib
-import struct
+import pickle
+import warnings
 import zipfile
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from vanejax.errors import InputError
-from vanejax.matching.inert_pickle import RESAVE, Storage, Tensor, are_counts, interpret
+from vanejax.errors import InputError, MissingExtra
+from vanejax.files import read_arrays, write_arrays
 
-_LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
-_LEGACY_VERSION = 1001
-_MAX_NDIM = 32
-_SLACK_BYTES = 1 << 20  # small expanded tensors (stride 0) take more memory than file
-_MAX_INFLATION = 8  # weights hardly compress: what unpacks to more is no file of weights
+FORMAT = "vanejax state dict"
 
 
 def load_state_dict(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Reads a model's weights from a PyTorch checkpoint, or from an .npz of arrays.
+    """Reads a state dict: a PyTorch checkpoint, or arrays of the same names (safetensors, .npz).
 
-    The contents decide, not the suffix (.pth, .pt, .t7, .tar, .npz): the zip format of
-    torch >= 1.6, the older one, and numpy archives. torch need not be installed, and no code in
-    the file is run. Memory stays below the file's size plus that of the arrays, which is at most
-    the file's (8 times that for a compressed .npz), give or take what the pickle itself needs.
-
-    In a checkpoint that holds more than the weights, the model is the mapping under
-    ``state_dict``, ``model_state_dict`` or ``model``, the first of these with tensors in it,
-    else the top level. Entries that are no tensors are left out. The prefix ``module.``
-    (``torch.nn.DataParallel``) goes where every name has it.
-
-    Args:
-      path: file on disk; it is read only.
+    The contents decide, not the suffix (.pth, .pt, .t7, .tar, .safetensors, .npz). In a checkpoint
+    that holds more than the weights, the model is the mapping under ``state_dict``,
+    ``model_state_dict`` or ``model``, the first of these with tensors in it, else the top level.
+    Entries that are no tensors are left out. The prefix ``module.`` (``torch.nn.DataParallel``)
+    goes where every name has it.
 
     Returns:
-      Arrays by name in the file's order, C-contiguous, writable and of the file's type: float64,
-      float32, float16, bfloat16 (``ml_dtypes.bfloat16``; JAX takes it as it is), int64, int32,
-      int16, int8, uint8 or bool; from .npz also the wider unsigned integers. The layout is
-      PyTorch's ([out, in] for a linear layer). Names that share one tensor in the file share one
-      array.
+      Arrays by name in PyTorch's layout ([out, in] for a linear layer); bfloat16 becomes float32.
 
     Raises:
-      InputError: the file is missing, truncated or damaged, is no checkpoint, names anything
-        but the parts of a state dict, claims sizes that its bytes do not bear out, is
-        big-endian, a TorchScript archive or a Lua Torch7 file, or holds no tensors.
+      InputError: the file is missing, damaged, or holds no tensors or more than tensors and plain
+        values.
+      MissingExtra: a PyTorch file, but torch is not installed.
     """
-    path = pathlib.Path(path)
+    path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: no such file. Give the path of a .pth, .pt, .t7 or .npz file.")
+        raise InputError(f"{path}: no such file; give a .pth, .pt, .t7, .safetensors or .npz file")
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
+        arrays = read_arrays(path)[0] if _holds_arrays(path) else _read_checkpoint(path)
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); download or copy it again") from error
+    if arrays and all(name.startswith("module.") for name in arrays):
+        arrays = {name.removeprefix("module."): array for name, array in arrays.items()}
+    if not arrays:
+        raise InputError(f"{path}: holds no tensors, neither at its top level nor as a state dict")
+    return arrays
+
+
+def convert_state_dict(
+    path: str | os.PathLike[str], out: str | os.PathLike[str]
+) -> tuple[str, dict[str, np.ndarray]]:
+    """Writes the weights of a published RPM-Net or PointNetLK as safetensors (or .npz).
+
+    Returns:
+      The network's name, and its state dict.
+
+    Raises:
+      InputError: as `load_state_dict`, or these are the weights of neither network.
+    """
+    arrays = load_state_dict(path)
+    name, variables = ("RPM-Net", rpmnet_variables)
+    if "dt" in arrays:
+        name, variables = ("PointNetLK", pointnetlk_variables)
     try:
-        arrays = _read_zip(data) if data.startswith(b"PK\3\4") else _read_legacy(data)
+        variables(arrays)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except Exception as error:
-        # Damaged or hostile bytes break parsers in many ways (struct, zlib, index, type, ...);
-        # to the caller they are one fact, and the chained error keeps which it was.
-        raise InputError(
-            f"{path}: damaged or truncated ({type(error).__name__}: {ascii(str(error))[:200]}). "
-            "Download or copy it again and compare its size with the source's."
+    write_arrays(out, arrays, {"format": FORMAT, "network": name, "source": Path(path).name})
+    return name, arrays
+
+
+def _holds_arrays(path: Path) -> bool:
+    """Whether this is an .npz or a safetensors file: PyTorch's files are zip archives too."""
+    with open(path, "rb") as file:
+        head = file.read(9)
+    if head[:2] != b"PK":
+        return head[8:] == b"{"  # a safetensors header, behind its length
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return all(name.endswith(".npy") for name in archive.namelist())
+    except zipfile.BadZipFile as error:
+        raise ValueError(str(error)) from error
+
+
+def _read_checkpoint(path: Path) -> dict[str, np.ndarray]:
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        raise MissingExtra(
+            f"{path}: neither safetensors nor .npz. If it is a PyTorch checkpoint, install torch "
+            "to read it: pip install 'vanejax[torch]'"
         ) from error
-    if all(name.startswith("module.") for name in arrays):
-        arrays = {name.removeprefix("module."): array for name, array in arrays.items()}
-    return arrays
-
-
-def _read_zip(data: bytes) -> dict[str, np.ndarray]:
-    """Since torch 1.6: <folder>/data.pkl and the storages <folder>/data/<key>; or an .npz."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        entries = {entry.filename: entry for entry in archive.infolist()}
-        if entries and all(name.endswith(".npy") for name in entries):
-            return _read_npz(archive, len(data))
-    pickles = [name for name in entries if name.rpartition("/")[2] == "data.pkl"]
-    if not pickles:
-        raise InputError(f"a zip file, but neither PyTorch's nor numpy's. Instead, {RESAVE}.")
-    folder = min(pickles, key=len).removesuffix("data.pkl")
-    if folder + "constants.pkl" in entries:
+    scalar = np._core.multiarray.scalar
+    # scores and options stand beside the weights in published checkpoints
+    harmless = [
+        argparse.Namespace,
+        np.dtype,
+        *(type(np.dtype(kind)) for kind in ("f8", "f4", "i8")),
+    ]
+    harmless += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+    try:
+        with torch.serialization.safe_globals(harmless), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an error follows, or the file is of an old version
+            loaded = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        reason = str(error).rpartition("WeightsUnpickler error: ")[2].split(". ")[0].strip()
         raise InputError(
-            "a TorchScript archive, which is a program, not a state dict. In PyTorch, load it "
-            'with torch.jit.load, then torch.save(loaded.state_dict(), "weights.pth").'
-        )
-    contents = {
-        name.removeprefix(folder): _stored_bytes(data, entry)
-        for name, entry in entries.items()
-        if name.startswith(folder)
-    }
-    _require_little_endian(contents.get("byteorder", b"little") == b"little")
-    storages = {
-        name.removeprefix("data/"): raw
-        for name, raw in contents.items()
-        if name.startswith("data/")
-    }
-    return _model_arrays(interpret(io.BytesIO(contents["data.pkl"])), storages, len(data))
-
-
-def _stored_bytes(data: bytes, entry: zipfile.ZipInfo) -> memoryview:
-    """An entry's bytes where they lie. Without its checksum, which torch can be told to omit."""
-    if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
-        raise InputError(
-            f"its entry {entry.filename[:80]!r} is compressed or encrypted, as torch.save never "
-            f"writes. Take the original file, or {RESAVE}."
-        )
-    header = entry.header_offset
-    if header < 0 or data[header : header + 4] != b"PK\3\4":
-        raise ValueError("zip entry without its header")
-    start = header + 30 + sum(struct.unpack_from("<HH", data, header + 26))
-    # Past the end of the file the slice is short: what reads it compares lengths.
-    return memoryview(data)[start : start + entry.file_size]
-
-
-def _read_npz(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, np.ndarray]:
-    entries = archive.infolist()
-    # zipfile never inflates an entry past the size that its directory states.
-    if sum(entry.file_size for entry in entries) > _MAX_INFLATION * file_bytes + _SLACK_BYTES:
-        raise InputError(
-            f"would unpack to more than {_MAX_INFLATION} times its size, as weights never do. "
-            "If the source is sound, write it again with numpy.savez (uncompressed)."
-        )
-    arrays = {}
-    for entry in entries:
-        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise InputError("packed by a method that numpy does not use. Use numpy.savez.")
-        content = archive.read(entry)
-        stream = io.BytesIO(content)
-        # Not numpy.load: it allocates what the header claims before it looks for the bytes.
-        is_first_version = np.lib.format.read_magic(stream) == (1, 0)
-        read_header = getattr(np.lib.format, f"read_array_header_{2 - is_first_version}_0")
-        shape, is_fortran, dtype = read_header(stream)
-        name = entry.filename.removesuffix(".npy")
-        if dtype.kind in "SU":
-            continue
-        if dtype.kind not in "biuf" or dtype.itemsize > 8 or dtype.byteorder == ">":
-            raise InputError(
-                f"array {name[:80]!r} is of type {str(dtype)[:40]!r}: only little-endian numbers "
-                "are read (an object array would have to be unpickled). Convert it, for example "
-                "array.astype(numpy.float32), and write the file again with numpy.savez."
-            )
-        payload = memoryview(content)[stream.tell() :]
-        if not are_counts(shape) or math.prod(shape) * dtype.itemsize != payload.nbytes:
-            raise ValueError(f"array {name[:80]!r} has other bytes than its shape needs")
-        steps = [math.prod(shape[:i] if is_fortran else shape[i + 1 :]) for i in range(len(shape))]
-        arrays[name] = _strided_copy(payload, dtype, 0, shape, steps)
-    if not arrays:
-        raise InputError("holds no arrays of numbers. Give the .npz with the model's weights.")
-    return arrays
-
-
-def _read_legacy(data: bytes) -> dict[str, np.ndarray]:
-    """Before torch 1.6: pickles of magic, version, system, object and storage keys; storages."""
-    if _LEGACY_MAGIC.to_bytes(10, "little") not in data[:32]:
-        if data[:4] in (b"\3\0\0\0", b"\4\0\0\0", b"3\n1\n", b"4\n1\n"):
-            raise InputError(
-                "a file of Lua Torch7, not of PyTorch. Convert it to .npz with a Torch7 reader "
-                "(for example the package torchfile) and numpy.savez."
-            )
-        if data[257:262] == b"ustar":
-            raise InputError(f"a tar archive, PyTorch's format of 2016. Instead, {RESAVE}.")
-        raise InputError(
-            f"not a PyTorch checkpoint or .npz: it begins with {data[:16]!r}. A web page or a Git "
-            "LFS pointer in place of the download looks like text; a plain pickle is not read "
-            f"at all. Download the file again, or {RESAVE}."
-        )
-    stream = io.BytesIO(data)
-    if interpret(stream) != _LEGACY_MAGIC or interpret(stream) != _LEGACY_VERSION:
-        raise InputError(f"in an unknown version of PyTorch's format. Instead, {RESAVE}.")
-    _require_little_endian(interpret(stream)["little_endian"] is True)
-    dtypes: dict[str, np.dtype] = {}
-    top = interpret(stream, dtypes)
-    keys = interpret(stream)
-    storages = {}
-    start = stream.tell()
-    for key in keys:
-        if not isinstance(key, str) or key not in dtypes:
-            raise ValueError("a storage that the pickle does not name")
-        (count,) = struct.unpack_from("<q", data, start)
-        end = start + 8 + count * dtypes[key].itemsize
-        if count < 0 or end > len(data):
-            raise ValueError(f"{count} elements of {dtypes[key]}, but the file ends before")
-        storages[key] = memoryview(data)[start + 8 : end]
-        start = end
-    return _model_arrays(top, storages, len(data))
-
-
-def _require_little_endian(is_little: bool) -> None:
-    if not is_little:
-        raise InputError(f"written on a big-endian machine. On a little-endian one, {RESAVE}.")
-
-
-def _model_arrays(
-    top: Any, storages: Mapping[str, memoryview], file_bytes: int
-) -> dict[str, np.ndarray]:
-    """Picks the model's tensors and copies them out, in all within the file's size."""
-    if not isinstance(top, dict):
-        raise InputError(
-            f"holds a {type(top).__name__}, not a mapping of names to tensors. Instead, {RESAVE}."
-        )
-    for candidate in [*map(top.get, ("state_dict", "model_state_dict", "model")), top]:
-        entries = candidate.items() if isinstance(candidate, dict) else ()
-        tensors = {name: value for name, value in entries if isinstance(value, Tensor)}
+            f"{path}: holds more than weights, or no weights ({reason[:200]}); nothing was run. If "
+            'you trust it, load it in PyTorch and torch.save(model.state_dict(), "weights.pth")'
+        ) from error
+    except Exception as error:  # torch has many for damaged files: RuntimeError, EOFError, ...
+        raise ValueError(f"{type(error).__name__}: {str(error)[:100]}") from error
+    top = loaded if isinstance(loaded, Mapping) else {}
+    for mapping in [*map(top.get, ("state_dict", "model_state_dict", "model")), top]:
+        entries = mapping.items() if isinstance(mapping, Mapping) else ()
+        tensors = {name: value for name, value in entries if isinstance(value, torch.Tensor)}
         if tensors:
             break
-    else:
-        keys = ", ".join(repr(key[:40]) for key in list(top)[:10])
-        raise InputError(
-            "holds no tensors at its top level or under 'state_dict', 'model_state_dict' or "
-            f"'model'; its keys are: {keys or 'none'}. Instead, {RESAVE}."
-        )
-    arrays: dict[str, np.ndarray] = {}
-    shared: dict[Any, np.ndarray] = {}
-    bytes_left = file_bytes + _SLACK_BYTES
-    for name, tensor in tensors.items():
-        try:
-            storage = _checked_storage(tensor, storages)
-        except ValueError as error:
-            raise InputError(f"tensor {name[:80]!r} {error}. Download the file again.") from error
-        first = storage.view_start + tensor.offset
-        identity = (storage.key, storage.dtype, first, tensor.size, tensor.stride)
-        if identity not in shared:
-            bytes_left -= math.prod(tensor.size) * storage.dtype.itemsize
-            if bytes_left < 0:
-                raise InputError(
-                    f"tensor {name[:80]!r} of shape {tensor.size} needs more memory than the file "
-                    "has: it is expanded or overlaps others. Make the model's tensors contiguous "
-                    f"(tensor.contiguous()), then {RESAVE}."
-                )
-            raw = storages[storage.key]
-            shared[identity] = _strided_copy(raw, storage.dtype, first, tensor.size, tensor.stride)
-        arrays[name] = shared[identity]
-    return arrays
-
-
-def _checked_storage(tensor: Tensor, storages: Mapping[str, memoryview]) -> Storage:
-    """The tensor's storage; ValueError (what is wrong) if the tensor isn't wholly inside."""
-    storage, size, stride = tensor.storage, tensor.size, tensor.stride
-    if not isinstance(storage, Storage) or storage.key not in storages:
-        raise ValueError("has no data in the file")
-    stored = storages[storage.key].nbytes
-    if stored != storage.count * storage.dtype.itemsize:
-        raise ValueError(f"needs {storage.count} x {storage.dtype}, but {stored} bytes are there")
-    if not (isinstance(size, tuple) and isinstance(stride, tuple) and len(size) == len(stride)):
-        raise ValueError("has no shape")
-    if len(size) > _MAX_NDIM or not are_counts((tensor.offset, *size, *stride)):
-        raise ValueError("has a shape, strides or an offset out of range")
-    last = tensor.offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
-    if 0 not in size and last >= storage.view_count:
-        raise ValueError(
-            f"(shape {size}, strides {stride}, offset {tensor.offset}) reaches outside its "
-            f"{storage.view_count} elements"
-        )
-    return storage
-
-
-def _strided_copy(
-    raw: memoryview, dtype: np.dtype, first: int, shape: tuple[int, ...], steps: Any
-) -> np.ndarray:
-    """C-contiguous copy of elements ``first + index * steps``; numpy checks the bounds again."""
-    if 0 in shape:
-        return np.zeros(shape, dtype)
-    # A dimension of one may have any stride: it is never taken.
-    strides = [step * dtype.itemsize if n > 1 else 0 for n, step in zip(shape, steps, strict=True)]
-    # A bool's byte other than 0 and 1 is true, as in C; numpy must not see it as a bool.
-    stored = np.dtype(np.uint8) if dtype.kind == "b" else dtype
-    view = np.ndarray(shape, stored, buffer=raw, offset=first * dtype.itemsize, strides=strides)
-    return np.array(view != 0 if dtype.kind == "b" else view, order="C")
+    if sum(value.nbytes for value in tensors.values()) > path.stat().st_size + (1 << 20):
+        raise ValueError("its tensors are larger than the file: save them contiguous")
+    return {
+        str(name): (value.float() if value.dtype == torch.bfloat16 else value).detach().numpy()
+        for name, value in tensors.items()
+    }
 
 
 def rpmnet_variables(state_dict: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -289,7 +146,9 @@ def rpmnet_variables(state_dict: Mapping[str, np.ndarray]) -> dict[str, Any]:
     Raises:
       InputError: a name is missing or unknown, a shape is not RPM-Net's, a value not finite.
     """
-    weights = _StateDict(state_dict, "RPM-Net")
+    # learning3d names the first network feature_model
+    names = {name: name.replace("feature_model.", "feat_extractor.", 1) for name in state_dict}
+    weights = _StateDict({names[name]: state_dict[name] for name in state_dict}, "RPM-Net")
 
     def mlp(prefix: str, label: str, widths: tuple[int, ...], *, normed_last: bool) -> dict:
         layers: dict[str, Any] = {}

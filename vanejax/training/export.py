@@ -35,7 +35,7 @@ def export_workdir(
     Args:
       workdir: as ``experiments.train`` left it: run.json, scans.npz and checkpoints/. It is only
         read, so a run that still goes on may be exported.
-      path: the file to write, .npz.
+      path: the file to write: safetensors, or .npz by that suffix.
       checkpoint: the one with the smallest error on the validation pairs, or the newest.
 
     Returns:
@@ -47,7 +47,9 @@ def export_workdir(
     """
     workdir = Path(workdir)
     if not workdir.is_dir():
-        raise InputError(f"{workdir}: no such folder; give the work folder of a training run")
+        raise InputError(
+            f"{workdir}: no such folder; give the work folder of a training run, or a checkpoint"
+        )
     record = workdir / "run.json"
     run = _read_run(record)
     scans = load_scan_set(workdir / "scans.npz")
