@@ -37,13 +37,6 @@ def test_no_face_is_nearer(vane: Part, spread_mm: float) -> None:
         np.testing.assert_allclose(every[face], foot, rtol=0, atol=1e-12)
 
 
-def test_points_of_the_surface_are_on_it(vane: Part) -> None:
-    """Where the samples of `Surface.exact` miss long thin faces by up to a millimetre."""
-    points, _, _ = vane.sample(3_000, seed=2)
-    closest = NearestFace(vane).closest_points(points)
-    np.testing.assert_allclose(closest.points, points, rtol=0, atol=1e-12)
-
-
 def test_the_sides_of_a_box_edges_and_corners_too(box: Part) -> None:
     """Signed distances of a box are known: inside min(half - |x|), outside |max(|x| - half, 0)|."""
     half = np.array([20.0, 30.0, 5.0])

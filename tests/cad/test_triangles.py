@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tracemalloc
 from collections import Counter
 from collections.abc import Callable
@@ -136,23 +135,7 @@ def peak_bytes(work: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
-def number_of_calls(work: Callable[[], object]) -> int:
-    """Of functions in Python and C: what a loop over faces would show."""
-    count = 0
-
-    def watch(frame: object, event: str, argument: object) -> None:
-        nonlocal count
-        count += event in ("call", "c_call")
-
-    before = sys.getprofile()
-    sys.setprofile(watch)
-    try:
-        work()
-    finally:
-        sys.setprofile(before)
-    return count
-
-
+@pytest.mark.slow
 def test_memory_grows_with_the_faces_and_no_faster(tmp_path):
     """Ten million faces must fit in 12 GB with Embree's scene: below 500 bytes a face here."""
     prepared(sphere_file(tmp_path, 3)[0])  # what is imported on the way does not count
@@ -162,9 +145,3 @@ def test_memory_grows_with_the_faces_and_no_faster(tmp_path):
     peak = peak_bytes(lambda: prepared(large))
     assert peak < 500 * many
     assert peak < 1.2 * 16 * peak_bytes(lambda: prepared(small))
-
-
-def test_no_loop_goes_over_the_faces(tmp_path):
-    path, faces = sphere_file(tmp_path, 6)
-    prepared(path)
-    assert number_of_calls(lambda: prepared(path)) < 0.1 * faces

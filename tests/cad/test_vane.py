@@ -17,7 +17,7 @@ import scipy.optimize
 import scipy.spatial
 
 from vanejax.cad.parametric_vane import DOUBLET, GuideVaneSegment, guide_vane
-from vanejax.cad.part import Part, load_part
+from vanejax.cad.part import Part
 from vanejax.errors import InputError
 
 
@@ -86,17 +86,6 @@ def test_is_one_watertight_solid(part: Part) -> None:
     assert part.notes == ()  # nothing had to be repaired
     # the gas passages go through: one between the two vanes, none elsewhere (V - E + F = 2 - 2g)
     assert part.mesh.euler_number == 0
-
-
-def test_volume_is_that_of_its_pieces(part: Part) -> None:
-    # the estimate takes rails at mean radii and fillets on straight walls: a few parts in 1000
-    assert part.mesh.volume == pytest.approx(estimated_volume(DOUBLET), rel=0.01)
-
-
-def test_fits_the_camera(part: Part) -> None:
-    assert 90 < part.extent_mm.max() < 120
-    np.testing.assert_allclose(part.center, 0, atol=1e-5)  # f32 eps x 60 mm
-    assert 50 < part.radius < 80
 
 
 def test_has_no_inner_walls(part: Part) -> None:
@@ -202,25 +191,7 @@ def test_neighbours_in_the_ring_do_not_overlap(part: Part) -> None:
     assert overlaps(width - 1.2 * gap)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"fillet_radius_mm": 0.0},
-        {"slot_width_mm": 0.0},
-        {"hook_length_mm": 0.0},
-        {"segment_gap_mm": 0.0},
-        {"outer_wall_angle_deg": -7.0},
-        {"outer_wall_angle_deg": 0.0},
-    ],
-)
-def test_sizes_that_may_vanish(changes: dict) -> None:
-    segment = GuideVaneSegment(**changes)
-    part = guide_vane(segment)
-    assert part.mesh.is_watertight
-    assert part.mesh.euler_number == 0
-    assert part.mesh.volume == pytest.approx(estimated_volume(segment), rel=0.015)
-
-
+@pytest.mark.slow
 @hypothesis.settings(max_examples=15, deadline=None, derandomize=True)
 @hypothesis.given(
     vanes=st.integers(1, 4),
@@ -296,8 +267,3 @@ def test_airfoil_that_crosses_itself_is_refused() -> None:
     )
     with pytest.raises(InputError, match="crosses itself"):
         guide_vane(GuideVaneSegment(outer_airfoil=folded))
-
-
-def test_stl_round_trip(part: Part, tmp_path: Path) -> None:
-    part.export(tmp_path / "vane.stl")
-    assert load_part(tmp_path / "vane.stl", units="mm").sha256 == part.sha256

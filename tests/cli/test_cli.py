@@ -124,12 +124,6 @@ def test_what_is_not_known_is_said(files, fake, capsys) -> None:
     assert "nan" not in out.lower()
 
 
-def test_quiet_is_the_verdict_alone(files, fake, capsys) -> None:
-    fake(example_result("rejected"))
-    assert register(files, "--quiet") == 4
-    assert capsys.readouterr().out == "REJECTED: made up to be rejected\n"
-
-
 def test_colours_are_for_terminals_that_want_them(monkeypatch) -> None:
     verdict = example_result("rejected").verdict
     assert verdict_line(verdict, color=True).startswith("\x1b[1;31mREJECTED\x1b[0m: ")

@@ -245,17 +245,6 @@ def test_the_spacing_of_a_large_cloud_is_that_of_the_whole(tmp_path, monkeypatch
     assert inspect(tmp_path / "a.ply").spacing == pytest.approx(whole, rel=0.07)
 
 
-def test_real_scans_and_their_parts():
-    folder = SHARED / "real_scans"
-    if not folder.exists():
-        pytest.skip("the real scans are not in this checkout")
-    scan = check(inspect(folder / "Separator_1.ply"))
-    assert (scan.units, scan.looks_along, scan.kind) == ("m", "-z", "point cloud")
-    part = check(inspect(folder / "Separator.stl"))
-    assert part.watertight
-    assert "cm (188.7 mm)" in part.units_reason
-
-
 def test_weights(tmp_path, monkeypatch):
     np.savez(tmp_path / "w.npz", header=np.zeros(7, np.uint8), kernel=np.zeros((2, 2)))
     sampling = SimpleNamespace(num_reference=1024, num_source=717)

@@ -49,12 +49,6 @@ def test_its_size_is_bounded_whatever_the_mesh():
     assert np.linalg.norm(envelope.corners, axis=-1).max() < 1.05 * 50  # 1 / cos 12 deg + 1e-3
 
 
-def test_chunks_of_vertices_do_not_change_it(monkeypatch):
-    whole = PartEnvelope.around(knot())
-    monkeypatch.setattr("vanejax.scanner.image_window.VERTICES_AT_ONCE", 7)
-    np.testing.assert_allclose(PartEnvelope.around(knot()).corners, whole.corners, atol=1e-9)
-
-
 def covered(windows: list[Window], camera: Camera) -> np.ndarray:
     """[H, W] i64, in how many windows each pixel is."""
     image = np.zeros((camera.height, camera.width), int)
@@ -119,11 +113,3 @@ def test_behind_and_beside_the_camera():
     windows = envelope.windows(camera, among, pixels=1000)
     assert (covered(windows, camera) == 1).all()
     assert windows[0] == Window(slice(0, 7), slice(0, 128))
-
-
-def test_pixels_of_a_window_are_counted_row_by_row():
-    window = Window(slice(3, 8), slice(100, 1000))
-    row, column = window.pixels(np.arange(window.size))
-    expected = np.mgrid[window].reshape(2, -1)
-    np.testing.assert_array_equal((row, column), expected)
-    assert row.dtype == column.dtype == np.int32

@@ -43,16 +43,6 @@ def test_field_correlates_over_its_length_and_no_farther(fields):
     np.testing.assert_allclose(correlation(32), 0.0, atol=0.05)
 
 
-def test_field_depends_on_the_key_and_pixels_alone():
-    row, column = np.array([3, 3, 9]), np.array([2, 5, 8])
-    one, same, other = (
-        smooth_field(np.random.default_rng(seed), row, column, length_px=4.0) for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(one, same)
-    assert np.abs(one - other).min() > 0
-    assert smooth_field(np.random.default_rng(0), row[:0], column[:0], length_px=4.0).shape == (0,)
-
-
 def test_field_of_less_than_a_pixel_is_refused():
     with pytest.raises(InputError, match="1 pixel or more"):
         smooth_field(np.random.default_rng(0), np.zeros(1, int), np.zeros(1, int), length_px=0.5)
@@ -82,11 +72,6 @@ def test_jumps_are_those_between_neighbors(seed):
     found = [frozenset({places[i], places[j]}) for i, j in zip(a, b, strict=True)]
     assert len(found) == len(set(found))
     assert set(found) == neighbors_by_loop(image, 2.0)
-
-
-def test_no_pixels_have_no_jumps():
-    sides = depth_jumps(np.zeros(0, np.int32), np.zeros(0, np.float32), width=7, jump_mm=1.0)
-    assert [len(side) for side in sides] == [0, 0]
 
 
 def test_a_mixture_lies_between_both_sides_and_nearer_to_its_own():

@@ -14,7 +14,6 @@ from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import hemisphere_viewpoints
 from vanejax.scanner.clutter import (
     Clutter,
-    ClutterObject,
     ClutterScene,
     chips,
     clamps,
@@ -162,25 +161,6 @@ def test_drops_sit_on_a_sphere_along_its_normal():
         # facets of 3 mm turn the normal by up to 2 deg
         assert np.dot(top, base) / distance.max() / distance.min() > np.cos(np.radians(2))
         assert distance.min() < 50 - 0.25  # the skirt: no gap below the rim
-
-
-def test_nothing_lies_where_there_is_nothing_to_lie_on():
-    box = trimesh.creation.box((40.0, 30.0, 20.0))
-    part = part_from_mesh(box.vertices, box.faces, name="box")
-    for item in clutter_scene(part, Clutter(chips=20, drops=20), np.random.default_rng(0)).objects:
-        assert np.isfinite(item.mesh.vertices).all()
-        lowest = item.mesh.vertices[np.argmin(item.mesh.vertices[:, 2])]
-        assert np.max(np.abs(lowest[:2]) - [20, 15]) < 15
-        assert lowest[2] > 10 - 1.6  # a skirt's depth
-
-
-def test_an_open_part_gives_an_open_scene():
-    sheet = trimesh.creation.box((60.0, 40.0, 10.0))
-    part = part_from_mesh(sheet.vertices, sheet.faces[2:], name="sheet", must_be_closed=False)
-    scene = ClutterScene(part, (table(part),))
-    assert not scene.surface.closed
-    assert ClutterScene(bracket(), (table(bracket()),)).surface.closed
-    assert isinstance(scene.objects[0], ClutterObject)
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vanejax.cad.parametric_vane import guide_vane
 from vanejax.errors import InputError
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.point_file import read_points
 from vanejax.scans.scan_file import WRITTEN_SUFFIXES, load_scan, robust_extent, save_points
 
@@ -273,12 +270,6 @@ def test_numpy_files(tmp_path):
     assert np.array_equal(read_points(tmp_path / "c.npy").points, points)
 
 
-def test_a_mesh_serves_with_its_vertices(tmp_path):
-    scan = load_scan(put(tmp_path, "mesh.ply", ply(sheet(), faces=2, types=("double", "float"))))
-    assert np.array_equal(scan.points, sheet())
-    assert "is a mesh of 2 faces: its vertices are used" in scan.notes
-
-
 def test_text_without_names(tmp_path):
     points, normals = sheet(), facing(sheet())
     named = read_points(put(tmp_path, "a.txt", table(points, normals)))
@@ -307,24 +298,12 @@ def test_padding_after_the_last_point_is_no_point(tmp_path):
         assert np.array_equal(file.points, read_points(put(tmp_path, name, data)).points)
 
 
-def test_a_byte_order_mark_is_no_part_of_the_first_number(tmp_path):
-    file = read_points(put(tmp_path, "a.csv", b"\xef\xbb\xbf1.5,2.5,3.5\n4,5,6\n"))
-    assert np.array_equal(file.points, [[1.5, 2.5, 3.5], [4, 5, 6]])
-
-
 @pytest.mark.parametrize(
     "row", ["1,5;2,5;3,5", "1,5 2,5 3,5", "1,5\t-2,5\t3,5", "1,5,2,5,3,5", "-1,25,2,5,3,75"]
 )
 def test_decimal_commas_are_refused(tmp_path, row):
     with pytest.raises(InputError, match=r"a\.csv: .*decimal commas"):
         read_points(put(tmp_path, "a.csv", f"{row}\n".encode() * 60))
-
-
-def test_whole_numbers_apart_by_commas_are_no_decimal_commas(tmp_path):
-    file = read_points(put(tmp_path, "a.csv", b"1,2,3\n4, 5, 6\n"))
-    assert np.array_equal(file.points, [[1, 2, 3], [4, 5, 6]])
-    file = read_points(put(tmp_path, "b.csv", b"1,2,3,0,0,1\n4,5,6,0,1,0\n"))
-    assert np.array_equal(file.normals, [[0, 0, 1], [0, 1, 0]])
 
 
 def cut(data: bytes, share: float) -> bytes:
@@ -454,15 +433,6 @@ def test_a_file_that_may_not_be_read(tmp_path):
         load_scan(path)
 
 
-def test_a_file_that_fails_while_it_is_read(tmp_path, monkeypatch):
-    def fail(path):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr("vanejax.scans.point_file.read_ply", fail)
-    with pytest.raises(InputError, match=r"a\.ply: cannot be read: Permission denied"):
-        load_scan(put(tmp_path, "a.ply", PLY))
-
-
 WHOLE = {
     **{"binary.ply": PLY, "text.ply": PLY_TEXT, "list.ply": ply(P, faces=1, extra=True)},
     **{"big.ply": ply(P, form="binary_big_endian", extra=True, faces=1)},
@@ -532,13 +502,6 @@ def test_metres_are_told_from_millimetres_by_the_part(tmp_path):
     assert not [note for note in given.notes if "metres" in note]
 
 
-def test_a_given_origin_is_in_millimetres(tmp_path):
-    save_points(tmp_path / "m.ply", sheet() / 1000)
-    origin = np.array([1.0, 2.0, 3.0])
-    scan = load_scan(tmp_path / "m.ply", units="m", sensor_origin=origin)
-    assert np.array_equal(scan.sensor_origin, origin)
-
-
 def test_a_unit_that_cannot_be_is_refused_or_told(tmp_path):
     save_points(tmp_path / "cm.ply", sheet() / 10_000)
     with pytest.raises(InputError, match=r"cannot be told: .* 0\.011.* mm .* 11\.\d+ mm in m"):
@@ -592,16 +555,6 @@ def test_saving_refuses_what_cannot_be(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_scan_of_the_vane_comes_back(tmp_path):
-    part = guide_vane()
-    view = Scanner(part).scan(Camera().scaled(0.2), hemisphere_viewpoints(part.center).view(7))
-    save_points(tmp_path / "vane.ply", view.points, view.normals)
-    scan = load_scan(tmp_path / "vane.ply", part_extent_mm=part.extent_mm)
-    assert np.array_equal(scan.points, view.points)
-    assert scan.looks_along == "-z"
-    assert scan.notes == ("the sensor is taken to stand at the scan's origin, looking along -z",)
-
-
 @pytest.mark.parametrize("number", range(1, 9))
 def test_real_scans(number):
     path = REAL_SCANS / f"Separator_{number}.ply"
@@ -615,6 +568,7 @@ def test_real_scans(number):
     assert (np.einsum("ni,ni->n", scan.points, scan.normals) <= 0).all()
 
 
+@pytest.mark.slow
 def test_a_million_points_are_read_in_seconds(tmp_path):
     rng = np.random.default_rng(0)
     points = rng.uniform(-80, 80, (1_000_000, 3)) + np.array([0, 0, 500])

@@ -85,14 +85,6 @@ def test_the_plane_found_is_the_tables():
     assert plane.thickness_mm == pytest.approx(0.4, rel=0.2)  # four times the noise
 
 
-def test_a_wall_behind_which_the_part_stands_is_no_table():
-    """The sensor is on the other side: it cannot have seen the part through it."""
-    points, _ = seen(ClutterScene(vane(), (table(vane()),)))
-    (plane,) = segment(points, vane(), sensor_origin=ORIGIN).tables
-    below = -200.0 * plane.normal + points.mean(axis=0)
-    assert segment(points, vane(), sensor_origin=below).tables == ()
-
-
 def test_a_plane_through_the_middle_of_things_is_no_table():
     rng = np.random.default_rng(0)
     flat = np.column_stack([rng.uniform(-200, 200, (20_000, 2)), np.zeros(20_000)])

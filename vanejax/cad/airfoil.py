@@ -54,32 +54,6 @@ class Section:
     normals: np.ndarray
     exit_half_wedge_deg: float
 
-    @property
-    def leading_edge_indices(self) -> np.ndarray:
-        """Indices into the contour of the points on the leading edge's circle."""
-        start = _SUCTION_ARC + _SUCTION_CUBIC
-        return np.arange(start, start + _LEADING_EDGE + 1)
-
-    @property
-    def trailing_edge_indices(self) -> np.ndarray:
-        """Indices into the contour of the points on the trailing edge's circle."""
-        count = len(self.contour_mm)
-        return np.arange(count - _TRAILING_EDGE, count + 1) % count
-
-    @property
-    def max_thickness_mm(self) -> float:
-        """Diameter of the largest circle that fits into the section.
-
-        The circle inside that touches at p with inward normal n and passes through q has radius
-        |q - p|^2 / (2 n.(q - p)); the smallest over q fits, and the largest of those over p is it.
-        """
-        offset = self.contour_mm[None] - self.contour_mm[:, None]
-        inward = -np.sum(self.normals[:, None] * offset, -1)
-        squared = np.sum(offset**2, -1)
-        facing = inward > 1e-9 * (1 + squared)
-        radius = np.where(facing, squared / np.where(facing, 2 * inward, 1), np.inf)
-        return float(2 * radius.min(1).max())
-
     def offset(self, distance_mm: float) -> np.ndarray:
         """The contour [P, 2] in mm moved outward by ``distance_mm`` along its normals."""
         return self.contour_mm + distance_mm * self.normals
@@ -140,12 +114,6 @@ class Airfoil:
         """Angle of the line from the leading to the trailing edge's centre, negative."""
         edges = self.leading_edge_radius_mm + self.trailing_edge_radius_mm
         return -math.degrees(math.atan2(self.tangential_chord_mm, self.axial_chord_mm - edges))
-
-    @property
-    def chord_mm(self) -> float:
-        """Length along the stagger line, edges included."""
-        edges = self.leading_edge_radius_mm + self.trailing_edge_radius_mm
-        return math.hypot(self.tangential_chord_mm, self.axial_chord_mm - edges) + edges
 
     def toward(self, other: Airfoil, fraction: float) -> Airfoil:
         """The airfoil whose parameters lie at ``fraction`` (0 self, 1 other) between the two."""

@@ -73,12 +73,6 @@ class InvestmentCasting:
                 "15 to 60 mm is usual"
             )
 
-    @property
-    def limits_mm(self) -> tuple[float, float]:
-        """The least and the greatest offset along the normal, without the bow."""
-        swing = CUT * self.waviness_mm
-        return self.allowance_mm - swing, self.allowance_mm + swing
-
 
 def as_cast(part: Part, casting: InvestmentCasting, rng: np.random.Generator) -> Part:
     """One casting of a part, in the CAD model's frame.

@@ -51,6 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_good_network_and_a_bad_one_are_told_apart(
     folder: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
