@@ -9,9 +9,10 @@ import pytest
 from example_result import example_result
 from example_scans import ideal_scan, model, vane
 
-from vanejax.localization.covariance import PATCHES, inflation, patches_of, uncertainty
+from vanejax.localization.covariance import PATCHES, inflation, uncertainty
 from vanejax.localization.pose_result import Refinement
 from vanejax.localization.residuals import SurfaceMatching
+from vanejax.localization.scan_patches import patch_labels
 
 
 def refinement(information: np.ndarray) -> Refinement:
@@ -56,8 +57,8 @@ def test_patches_are_small_and_of_one_place(rays):
     scan, _ = ideal_scan(vane())
     points = scan.points.astype(np.float64)
     measured = model(vane()) if rays else SurfaceMatching(model(vane()).surface, 20.0)
-    labels = patches_of(measured, points)
-    assert len(labels) == len(PATCHES)
+    labels = [patch_labels(measured, points, across) for across in PATCHES]
+
     for label, across in zip(labels, PATCHES, strict=True):
         assert label.shape == (len(points),)
         assert 20 < label.max() + 1 <= across ** (2 if rays else 3)

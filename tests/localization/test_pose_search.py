@@ -17,22 +17,24 @@ from example_scans import (
 )
 from scipy.spatial.transform import Rotation
 
-from vanejax.localization.pose_search import (
-    CHALLENGED,
+from vanejax.localization.pose_batch import (
     SAME_DEG,
     SAME_SHIFT,
-    Candidates,
-    challenge,
-    challengers,
     concatenate,
     distances,
     distinct,
+    select,
+)
+from vanejax.localization.pose_search import (
+    MOST_SYMMETRY_HYPOTHESES,
+    Candidates,
+    add_symmetry_hypotheses,
+    converge,
+    initial_poses,
     noise_level,
     search,
-    select,
-    settle,
-    spread_rotations,
-    starts,
+    symmetry_hypotheses,
+    uniform_rotations,
 )
 from vanejax.localization.residuals import SurfaceMatching
 from vanejax.localization.verification import Evidence
@@ -56,7 +58,7 @@ def test_spread_rotations_cover_all_rotations(count, cover_deg):
 
     Balls that cover it overlap, so they are larger: half as large again is a good cover.
     """
-    spread = spread_rotations(count)
+    spread = uniform_rotations(count)
     assert spread.shape == (count, 3, 3)
     gram = spread @ spread.swapaxes(1, 2)
     np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-12)
@@ -70,12 +72,12 @@ def test_spread_rotations_cover_all_rotations(count, cover_deg):
 
 def test_starts_put_the_middle_of_the_scan_where_it_belongs():
     points, truth = measured_points(vane())
-    found = starts(model(vane()), points, np.stack([truth.rotation, np.eye(3)]))
+    found = initial_poses(model(vane()), points, np.stack([truth.rotation, np.eye(3)]))
     right = select(found, 0)
     # the seen surface's middle, up to self-occlusion: a fifth of the radius
     assert pose_error(vane(), right, truth)[1] < 0.25 * vane().radius
     measured = SurfaceMatching(model(vane()).surface, reach_mm=20.0)
-    found = starts(measured, points, truth.rotation[None])
+    found = initial_poses(measured, points, truth.rotation[None])
     middle = select(found, 0).apply(points.mean(axis=0)[None])[0]
     np.testing.assert_allclose(middle, measured.surface.points[:1000].mean(axis=0), atol=1e-6)
 
@@ -134,7 +136,7 @@ def test_concatenate_and_select_are_each_others_inverse():
 
 def test_challengers_of_a_box_are_its_symmetries():
     best = random_view(box(), seed=3).inverse()
-    tried = challengers(model(box()).surface, best)
+    tried = symmetry_hypotheses(model(box()).surface, best)
     for axis in np.eye(3):
         symmetric = motion(box(), 180 * axis, np.zeros(3)) @ best
         angle, shift = distances(tried, symmetric, box())
@@ -145,7 +147,7 @@ def test_challengers_of_a_cube_are_quarter_turns_too():
     """A cube has no principal axes of its own; a square prism has one, and turns about that."""
     prism = box(40.0, 40.0, 90.0)
     best = random_view(prism, seed=3).inverse()
-    tried = challengers(model(prism).surface, best)
+    tried = symmetry_hypotheses(model(prism).surface, best)
     for turn in (90, -90, 180):
         angle, shift = distances(tried, motion(prism, [0, 0, turn], [0, 0, 0]) @ best, prism)
         assert np.min(angle + shift) < 1e-4
@@ -153,7 +155,7 @@ def test_challengers_of_a_cube_are_quarter_turns_too():
 
 def test_challengers_are_shifted_along_the_axes():
     best = random_view(box(), seed=3).inverse()
-    tried = challengers(model(box()).surface, best)
+    tried = symmetry_hypotheses(model(box()).surface, best)
     for axis, length in enumerate((80.0, 50.0, 30.0)):
         for share in (0.125, -0.125, 0.25, -0.25):
             shift = share * length * np.eye(3)[axis]
@@ -165,7 +167,7 @@ def test_challengers_are_shifted_along_the_axes():
 def test_challenge_finds_the_boxs_other_poses():
     points, truth = measured_points(box(), random_view(box(), seed=5), noise_mm=0.05)
     found = Candidates(batch(truth), np.array([1.0]))
-    pool = challenge(model(box()), points, found)
+    pool = add_symmetry_hypotheses(model(box()), points, found)
     for axis in np.eye(3):
         symmetric = motion(box(), 180 * axis, np.zeros(3)) @ truth
         angle, shift = distances(pool.part_from_camera, symmetric, box())
@@ -173,14 +175,14 @@ def test_challenge_finds_the_boxs_other_poses():
         assert angle[rank] < 0.5
         assert shift[rank] < 0.5
         assert pool.score[rank] > pool.score[0] - 0.1
-    assert len(pool) <= CHALLENGED
+    assert len(pool) <= MOST_SYMMETRY_HYPOTHESES
     assert (np.diff(pool.score) <= 0).all()
 
 
 def test_challenge_keeps_the_best_where_nothing_is_alike():
     points, truth = measured_points(bracket(), random_view(bracket(), seed=2), noise_mm=0.05)
     found = Candidates(batch(truth), np.array([1.0]))
-    pool = challenge(model(bracket()), points, found)
+    pool = add_symmetry_hypotheses(model(bracket()), points, found)
     angle, shift = distances(batch(pool.pose(0)), truth, bracket())
     assert angle[0] < 0.01
     assert shift[0] < 0.01
@@ -243,7 +245,7 @@ def test_the_seed_decides_everything():
 def test_settle_merges_poses_that_meet():
     points, truth = measured_points(vane())
     near = [motion(vane(), 4 * a, [0, 0, 1]) @ truth for a in (*np.eye(3), -np.eye(3)[0])]
-    found = settle(model(vane()), points, batch(*near))
+    found = converge(model(vane()), points, batch(*near))
     assert len(found) == 1
     assert max(pose_error(vane(), found.pose(0), truth)) < 0.1
 
@@ -280,6 +282,6 @@ def test_a_challenge_keeps_the_best_even_where_nothing_fits(monkeypatch):
 
     monkeypatch.setattr("vanejax.localization.pose_search.evidence", nothing_fits)
     points, pose = measured_points(box(), random_view(box(), seed=3))
-    kept = challenge(model(box()), points, Candidates(batch(pose), np.array([-0.5])))
+    kept = add_symmetry_hypotheses(model(box()), points, Candidates(batch(pose), np.array([-0.5])))
     assert kept.score[0] == -0.1
     assert (kept.score >= -0.1 * 1.4 - 1e-12).all()

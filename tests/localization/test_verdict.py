@@ -9,14 +9,14 @@ import pytest
 from example_result import example_result, pose
 
 from vanejax.localization.pose_result import Verdict
-from vanejax.localization.verdict import Limits, Rival, judge
+from vanejax.localization.verdict import CompetingHypothesis, Limits, judge
 
 RADIUS = 70.0
 GOOD = example_result()
-FAR = Rival(20.0, 180.0, 0.5, pose((180.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+FAR = CompetingHypothesis(20.0, 180.0, 0.5, pose((180.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 
 
-def verdict(*, rivals=(FAR,), limits=None, uncertainty=None, **verification) -> Verdict:
+def verdict(*, competing=(FAR,), limits=None, uncertainty=None, **verification) -> Verdict:
     """Of a result in which all is well but what is given."""
     said = {
         "inlier_share": 0.95,
@@ -29,7 +29,7 @@ def verdict(*, rivals=(FAR,), limits=None, uncertainty=None, **verification) -> 
         GOOD.refinement,
         dataclasses.replace(GOOD.verification, **(said | verification)),
         dataclasses.replace(GOOD.uncertainty, **(uncertainty or {})),
-        rivals,
+        competing,
         radius_mm=RADIUS,
         limits=limits,
     )
@@ -40,7 +40,7 @@ def test_all_well_is_accepted_and_says_why():
     assert found.status == "accepted"
     assert "95.0%" in found.reason
     assert "0.3 mm" in found.reason
-    assert verdict(rivals=()).status == "accepted"
+    assert verdict(competing=()).status == "accepted"
 
 
 REJECTED = {
@@ -119,38 +119,38 @@ def test_unknown_shares_do_not_count():
     assert found.status == "accepted"
 
 
-def rival(preference: float, turn: float = 120.0, shift: float = 3.25) -> Rival:
-    return Rival(preference, turn, shift, FAR.part_from_camera)
+def other(preference: float, turn: float = 120.0, shift: float = 3.25) -> CompetingHypothesis:
+    return CompetingHypothesis(preference, turn, shift, FAR.part_from_camera)
 
 
-def test_a_rival_within_the_noise_is_ambiguous():
-    found = verdict(rivals=[FAR, rival(1.0)])
+def test_another_pose_within_the_noise_is_ambiguous():
+    found = verdict(competing=[FAR, other(1.0)])
     assert found.status == "ambiguous"
     assert "another pose" in found.reason
     assert "120.0 deg" in found.reason
     assert "3.25 mm" in found.reason
 
 
-def test_the_nearest_rival_is_named_and_all_are_counted():
-    found = verdict(rivals=[rival(3.0, 90), FAR, rival(-0.5, 45), rival(2.0, 60)])
+def test_the_nearest_other_pose_is_named_and_all_are_counted():
+    found = verdict(competing=[other(3.0, 90), FAR, other(-0.5, 45), other(2.0, 60)])
     assert "3 other poses" in found.reason
     assert "45.0 deg" in found.reason
 
 
-def test_a_rival_that_fits_better_is_called_so():
+def test_another_pose_that_fits_better_is_called_so():
     limit = Limits().least_preference
-    assert "another pose better: one is turned" in verdict(rivals=[rival(-limit - 0.1)]).reason
-    assert "another pose nearly as well" in verdict(rivals=[rival(-limit)]).reason
+    assert "another pose better: one is turned" in verdict(competing=[other(-limit - 0.1)]).reason
+    assert "another pose nearly as well" in verdict(competing=[other(-limit)]).reason
 
 
 def test_the_threshold_of_preference():
     limit = Limits().least_preference
-    assert verdict(rivals=[rival(limit)]).status == "accepted"
-    assert verdict(rivals=[rival(limit - 1e-6)]).status == "ambiguous"
+    assert verdict(competing=[other(limit)]).status == "accepted"
+    assert verdict(competing=[other(limit - 1e-6)]).status == "ambiguous"
 
 
-def test_a_fault_outweighs_a_rival():
-    assert verdict(rivals=[rival(0.0)], inlier_share=0.1).status == "rejected"
+def test_a_fault_outweighs_a_other():
+    assert verdict(competing=[other(0.0)], inlier_share=0.1).status == "rejected"
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_a_weak_direction_is_ambiguous_and_named(axis, words):
         (Limits(least_support=0.5), {"inlier_share": 0.62}),
         (Limits(least_inlier_share=0.2, least_support=0.2), {"inlier_share": 0.3}),
         (Limits(most_violation_share=0.5), {"violation_share": 0.4}),
-        (Limits(least_preference=-1.0), {"rivals": [rival(0.0)]}),
+        (Limits(least_preference=-1.0), {"competing": [other(0.0)]}),
     ],
 )
 def test_limits_are_respected(limits, case):

@@ -26,7 +26,8 @@ from vanejax.cad.parametric_vane import GuideVaneSegment
 from vanejax.cad.part import part_from_mesh
 from vanejax.localization.pose_result import PointStatus, Verification
 from vanejax.localization.residuals import SurfaceMatching
-from vanejax.localization.verification import View, evidence, predicted_unmeasured, verify
+from vanejax.localization.scan_patches import View
+from vanejax.localization.verification import evidence, predicted_unmeasured, verify
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import look_at
 

@@ -32,8 +32,8 @@ from experiments.studies.comparison.settings import METHODS
 from vanejax.cli.program import main, make_parser
 from vanejax.cli.register import EXIT_CODES
 from vanejax.errors import InputError
-from vanejax.localization import clutter_removal as foreign_points
-from vanejax.localization.verdict import Rival
+from vanejax.localization import clutter_removal
+from vanejax.localization.verdict import CompetingHypothesis
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CHANGELOG.md"])
@@ -402,11 +402,14 @@ def reasons() -> dict[tuple[str, str], re.Pattern[str]]:
 def test_every_reason_of_the_verdict_has_its_line() -> None:
     """`register` can say nothing that the quick start does not explain, and the page no more."""
     pose = test_verdict.FAR.part_from_camera
-    better, close = Rival(-20.0, 180.0, 0.5, pose), Rival(1.0, 180.0, 0.5, pose)
+    better, close = (
+        CompetingHypothesis(-20.0, 180.0, 0.5, pose),
+        CompetingHypothesis(1.0, 180.0, 0.5, pose),
+    )
     said = [
         test_verdict.verdict(),
-        test_verdict.verdict(rivals=(close,)),
-        test_verdict.verdict(rivals=(better, close)),
+        test_verdict.verdict(competing=(close,)),
+        test_verdict.verdict(competing=(better, close)),
         test_verdict.verdict(inlier_share=0.65),
         test_verdict.verdict(inlier_share=0.65, unmeasured_share=float("nan")),
         test_verdict.verdict(tolerance_mm=3 * 0.03 * test_verdict.RADIUS),
@@ -424,7 +427,7 @@ def test_every_reason_of_the_verdict_has_its_line() -> None:
         assert len(rows) == 1, f"{verdict.status}: {verdict.reason}"
         used.add(rows[0])
     (left,) = set(reasons()) - used  # the one that is not said of a pose alone
-    tree = ast.parse(Path(foreign_points.__file__).read_text())
+    tree = ast.parse(Path(clutter_removal.__file__).read_text())
     templates = [
         "".join(p.value if isinstance(p, ast.Constant) else "…%" for p in text.values)
         for text in ast.walk(tree)

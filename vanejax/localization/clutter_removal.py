@@ -1,4 +1,4 @@
-"""Registration in a scan of more than the part: what is left out, and what it still says."""
+"""Clutter (table, clamps, chips) taken out of a scan, and what its rays still say about a pose."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ import numpy as np
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.localization.fine_registration import subset
+from vanejax.localization.pose_batch import stack
 from vanejax.localization.pose_result import PoseResult, Verdict
 from vanejax.localization.residuals import MeasurementModel
 from vanejax.localization.verdict import Limits
-from vanejax.rigid import RigidTransform
 from vanejax.scans.measured_scan import MIN_POINTS, MeasuredScan
 from vanejax.scans.segmentation import Segment, Segments, is_larger, segment
 
 WHEN = ("auto", "off", "on")
-MOST_FOREIGN = 0.33  # of the points: what registration bears as it is
-MOST_TABLE = 0.5  # of the points: above it the whole scan is not tried
-WORTH_IT = 0.02  # of the points: fewer that are not the part make no difference
+MOST_CLUTTER = 0.33  # of the points: with more of it the whole scan is tried second
+MOST_TABLE = 0.5  # of the points: with more of it the whole scan is not tried
+LEAST_CLUTTER = 0.02  # of the points: less makes no difference
 CHECKED_POINTS = 100_000
 
 
-def attempts(
+def segmentations(
     scan: MeasuredScan, part: Part, when: str, *, seed: int = 0
 ) -> Iterator[Segments | None]:
-    """What to take for the part, likeliest first; None for the scan as it is.
+    """Segmentations in which to seek the part, likeliest first; None for the whole scan.
 
     Args:
       scan: that may show more than the part.
       part: what is sought in it.
-      when: ``"off"``: only as it is; ``"on"``: only without what is not the part, if there is
-        any; ``"auto"``: without it first where that is more than a third, else second.
+      when: ``"off"``: only the whole scan; ``"on"``: only without clutter, if there is any;
+        ``"auto"``: without clutter first where that is more than a third, else second.
       seed: of the segmentation.
 
     Raises:
-      InputError: no such word.
+      InputError: ``when`` is none of these.
     """
     if when not in WHEN:
         raise InputError(f"segment must be one of {', '.join(WHEN)}, got {when!r}")
@@ -48,10 +48,10 @@ def attempts(
         return
     segments = segment(scan.points, part, sensor_origin=scan.sensor_origin, seed=seed)
     kept = segments.count(Segment.PART)
-    if when == "auto" and not whole_first and kept > (1 - MOST_FOREIGN) * len(scan.points):
+    if when == "auto" and not whole_first and kept > (1 - MOST_CLUTTER) * len(scan.points):
         whole_first = True
         yield None
-    differs = MIN_POINTS <= kept < (1 - WORTH_IT) * len(scan.points)
+    differs = MIN_POINTS <= kept < (1 - LEAST_CLUTTER) * len(scan.points)
     if differs:
         yield segments
     # with so much of a table in it no pose of the whole scan can be accepted
@@ -60,7 +60,7 @@ def attempts(
         yield None
 
 
-def without_others(scan: MeasuredScan, segments: Segments) -> MeasuredScan:
+def without_clutter(scan: MeasuredScan, segments: Segments) -> MeasuredScan:
     """The part's points alone, and a note that says what was taken away."""
     kept = segments.part
     table, other = segments.count(Segment.TABLE), segments.count(Segment.OTHER)
@@ -76,7 +76,7 @@ def without_others(scan: MeasuredScan, segments: Segments) -> MeasuredScan:
     )
 
 
-def with_others(
+def with_clutter(
     result: PoseResult,
     scan: MeasuredScan,
     segments: Segments,
@@ -85,10 +85,10 @@ def with_others(
     limits: Limits | None = None,
     seed: int = 0,
 ) -> PoseResult:
-    """A result for `without_others` as one for the scan.
+    """The result for the part's points, from `without_clutter`, as one for the whole scan.
 
-    Its indices become those of the scan. The rays of what was taken away are free as well: a pose
-    that stands in the way of too many of them is rejected.
+    Its indices become those of the scan. The rays to the clutter are free as well: a pose with the
+    part in the way of too many of them is rejected.
 
     Args:
       result: for the part's points alone.
@@ -96,7 +96,7 @@ def with_others(
       segments: of it.
       model: predicts points of the whole scan.
       limits: of the verdict.
-      seed: of the points that are asked.
+      seed: of the subset of the clutter that is checked.
     """
     kept = np.flatnonzero(segments.part)
     verification = dataclasses.replace(
@@ -105,14 +105,11 @@ def with_others(
     result = dataclasses.replace(result, verification=verification)
     if result.sensor_origin is None or result.verdict.status == "rejected":
         return result
-    pose = RigidTransform(
-        result.part_from_camera.rotation[None], result.part_from_camera.translation[None]
-    )
-    others = np.flatnonzero(~segments.part)
-    asked = others[subset(others, CHECKED_POINTS, seed + 5)]
-    now = model.residuals(pose, scan.points[asked])
-    behind = np.mean(now.hit & (now.deviation_mm < -verification.tolerance_mm))
-    share = float(behind) * len(others) / len(kept)
+    clutter = np.flatnonzero(~segments.part)
+    checked = clutter[subset(clutter, CHECKED_POINTS, seed + 5)]
+    residuals = model.residuals(stack(result.part_from_camera), scan.points[checked])
+    behind = np.mean(residuals.hit & (residuals.deviation_mm < -verification.tolerance_mm))
+    share = float(behind) * len(clutter) / len(kept)
     if share <= (limits or Limits()).most_violation_share:
         return result
     reason = (

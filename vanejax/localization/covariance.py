@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 
 from vanejax.localization.pose_result import Refinement, Uncertainty
-from vanejax.localization.residuals import MeasurementModel, RayCasting
 
 # of the scan, along the longer side of its view, and how many times the variance of independent
 # points their scores must show: white noise stays below
@@ -51,29 +50,16 @@ def _pointing_up(axis: np.ndarray) -> np.ndarray:
     return axis * np.sign(axis[np.argmax(np.abs(axis))])
 
 
-def _patches(model: MeasurementModel, points: np.ndarray, across: int) -> np.ndarray:
-    """[n] i64: which patch of the scan a point is in; squares of the sensor's view, or cubes."""
-    if isinstance(model, RayCasting):
-        rays = points - model.sensor_origin
-        rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        forward = rays.mean(axis=0)
-        points = rays - np.outer(rays @ forward, forward) / (forward @ forward)
-    size = max(float(np.ptp(points, axis=0).max()), 1e-9) / across
-    cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
-    _, patch = np.unique(cell @ np.array([1, 1 << 10, 1 << 20]), return_inverse=True)
-    return patch
-
-
-def patches_of(model: MeasurementModel, points: np.ndarray) -> list[np.ndarray]:
-    """For each size of `PATCHES`, [n] i64: which patch a point is in."""
-    return [_patches(model, points, across) for across in PATCHES]
-
-
 def inflation(information: np.ndarray, scores: np.ndarray, patches: list[np.ndarray]) -> float:
     """How much more the patches' scores vary than independent points would; at least 1.
 
     The median over the six directions of the sandwich's ratio, at each size of patches; the
     largest that is more than chance.
+
+    Args:
+      information: [6, 6] or, with an allowance, [7, 7].
+      scores: [n, 6] or [n, 7] of the points, with zero mean.
+      patches: for each size of `PATCHES`, [n] the patch of each point.
     """
     largest = 1.0
     for patch, chance in zip(patches, PATCHES.values(), strict=True):

@@ -1,6 +1,6 @@
 """Fine registration: Gauss-Newton on what the CAD model predicts for every measured point.
 
-Two stages. `descend` is robust and cheap: a few thousand points, many poses at once, a kernel that
+Two stages. `robust_gauss_newton` takes a few thousand points, many poses at once, and a kernel that
 narrows with the residuals; it has a wide basin. `refine` then takes every point and weighs it by
 the noise that the residuals themselves show (`noise`), down to the limit that this noise sets.
 """
@@ -12,10 +12,12 @@ import dataclasses
 import numpy as np
 
 from vanejax.errors import InputError
-from vanejax.localization.covariance import inflation, patches_of
-from vanejax.localization.noise import LEAST_COSINE, Noise, fit_noise, weights
+from vanejax.localization.covariance import PATCHES, inflation
+from vanejax.localization.noise import LEAST_COSINE, fit_noise, weights
+from vanejax.localization.pose_batch import select, stack
 from vanejax.localization.pose_result import Refinement
 from vanejax.localization.residuals import MeasurementModel, Precision, RayCasting, Residuals, moved
+from vanejax.localization.scan_patches import patch_labels
 from vanejax.rigid import RigidTransform
 from vanejax.scans.robust_statistics import robust_sigma
 
@@ -25,7 +27,7 @@ MOST_POINTS = 400_000  # more of them improve the pose by less than the casting'
 # of the part's radius: no sensor worth the name is noisier, and no kernel starts narrower
 SCALE_FLOOR = 0.01
 NOISE_FITS = 4  # of the last stage's iterations
-SETTLED = 0.1  # of a standard deviation of the pose: a smaller step says nothing new
+CONVERGED = 0.1  # of a standard deviation of the pose: a smaller step says nothing new
 
 
 def subset(points: np.ndarray, count: int, seed: int) -> np.ndarray:
@@ -35,7 +37,7 @@ def subset(points: np.ndarray, count: int, seed: int) -> np.ndarray:
     return np.sort(np.random.default_rng(seed).choice(len(points), count, replace=False))
 
 
-def descend(
+def robust_gauss_newton(
     model: MeasurementModel,
     part_from_camera: RigidTransform,
     points: np.ndarray,
@@ -43,7 +45,7 @@ def descend(
     iterations: int,
     precision: Precision = "grid",
     floor_mm: float | None = None,
-    settled_deg: float = 0.0,
+    min_step_deg: float = 0.0,
 ) -> tuple[RigidTransform, int]:
     """Robust Gauss-Newton from a batch of poses, on the same points for all of them.
 
@@ -59,7 +61,7 @@ def descend(
       iterations: at most.
       precision: as in `MeasurementModel.residuals`.
       floor_mm: the kernel's scale is no smaller; default 1 % of the part's radius.
-      settled_deg: a pose that turns by less, and moves by less of the part's radius, is left.
+      min_step_deg: a pose that turns by less, and moves by less of the part's radius, is left.
 
     Returns:
       H poses, and the number of iterations done.
@@ -73,13 +75,13 @@ def descend(
     while done < iterations and len(moving):
         done += 1
         poses = RigidTransform(rotation[moving], translation[moving])
-        now = model.residuals(poses, points, precision=precision)
-        deviation = now.deviation_mm
+        residuals = model.residuals(poses, points, precision=precision)
+        deviation = residuals.deviation_mm
         scale = robust_sigma(deviation, axis=1)
         scale = 2 * np.clip(scale, floor, 0.3 * radius)[:, None]
         weight = 1 / (1 + (deviation / scale) ** 2) ** 2
-        weighted = now.jacobian * weight[..., None]
-        information = weighted.swapaxes(-1, -2) @ now.jacobian
+        weighted = residuals.jacobian * weight[..., None]
+        information = weighted.swapaxes(-1, -2) @ residuals.jacobian
         gradient = np.einsum("hnk,hn->hk", weighted, deviation)
         information += damping * weight.sum(axis=1)[:, None, None]
         delta = -np.linalg.solve(information, gradient[..., None])[..., 0]
@@ -88,7 +90,7 @@ def descend(
         delta /= np.maximum(1, np.maximum(turn / np.radians(20), shift / 0.2))[:, None]
         poses = moved(model.part, poses, delta)
         rotation[moving], translation[moving] = poses.rotation, poses.translation
-        moving = moving[np.degrees(np.maximum(turn, shift)) >= settled_deg]
+        moving = moving[np.degrees(np.maximum(turn, shift)) >= min_step_deg]
     return RigidTransform(rotation, translation), done
 
 
@@ -122,44 +124,35 @@ def refine(
       InputError: a negative or infinite ``max_allowance_mm``.
     """
     check_allowance(max_allowance_mm)
-    batch = RigidTransform(init.rotation[None], init.translation[None])
+    batch = stack(init)
     coarse = points[subset(points, COARSE_POINTS, seed)]
-    batch, iterations = descend(model, batch, coarse, iterations=25, settled_deg=0.02)
+    batch, iterations = robust_gauss_newton(model, batch, coarse, iterations=25, min_step_deg=0.02)
     # what a narrow-band sensor needs and a noisy one does not mind: the kernel at the noise itself
-    batch, more = descend(
+    batch, more = robust_gauss_newton(
         model,
         batch,
         coarse,
         iterations=10,
         precision="samples",
         floor_mm=1e-4 * model.part.radius,
-        settled_deg=0.002,
+        min_step_deg=0.002,
     )
     iterations += more
-    allowance = 0.0
     # stock moves the part until it is known: the weights of a pose that far off are no use later
     passes = 2 if max_allowance_mm else int(len(points) > 2 * MEDIUM_POINTS)
-    for _ in range(passes):
-        medium = points[subset(points, MEDIUM_POINTS, seed)]
-        polished = _polish(model, medium, batch, max_iterations, allowance, max_allowance_mm)
-        batch, iterations = polished.part_from_camera, iterations + polished.iterations
-        allowance = polished.allowance_mm
-    points = points[subset(points, MOST_POINTS, seed)]
-    polished = _polish(model, points, batch, max_iterations, allowance, max_allowance_mm)
-    return Refinement(
-        part_from_camera=RigidTransform(
-            polished.part_from_camera.rotation[0], polished.part_from_camera.translation[0]
-        ),
-        converged=polished.converged,
-        iterations=iterations + polished.iterations,
-        method="ray casting" if isinstance(model, RayCasting) else "point to plane",
-        noise_mm=float(polished.noise.range_mm),
-        num_points=len(points),
-        num_inliers=polished.num_inliers,
-        information=polished.information,
-        allowance_mm=polished.allowance_mm,
-        allowance_sigma_mm=polished.allowance_sigma_mm,
-    )
+    allowance = 0.0
+    for size in (*passes * (MEDIUM_POINTS,), MOST_POINTS):
+        refinement = _least_squares(
+            model,
+            points[subset(points, size, seed)],
+            batch,
+            max_iterations=max_iterations,
+            allowance_mm=allowance,
+            max_allowance_mm=max_allowance_mm,
+        )
+        batch, allowance = stack(refinement.part_from_camera), refinement.allowance_mm
+        iterations += refinement.iterations
+    return dataclasses.replace(refinement, iterations=iterations)
 
 
 def check_allowance(max_allowance_mm: float) -> None:
@@ -171,45 +164,31 @@ def check_allowance(max_allowance_mm: float) -> None:
         )
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Polished:
-    """The end of `_polish`; the pose has a leading axis of 1."""
-
-    part_from_camera: RigidTransform
-    converged: bool
-    iterations: int
-    noise: Noise
-    num_inliers: int
-    information: np.ndarray
-    allowance_mm: float
-    allowance_sigma_mm: float
-
-
-def _polish(
+def _least_squares(
     model: MeasurementModel,
     points: np.ndarray,
     batch: RigidTransform,
+    *,
     max_iterations: int,
-    allowance: float,
+    allowance_mm: float,
     max_allowance_mm: float,
-) -> _Polished:
-    """Least squares along the rays, weighted by the noise that is fitted on the way."""
-    patches = patches_of(model, points)
+) -> Refinement:
+    """Gauss-Newton along the rays from one pose [1], weighted by the noise fitted on the way."""
+    patches = [patch_labels(model, points, across) for across in PATCHES]
     converged = False
     weight = np.full(len(points), np.inf)
-    bare = points
-    if allowance:
-        pose = RigidTransform(batch.rotation[0], batch.translation[0])
-        bare = without_stock(model, points, pose, allowance)
+    surface_points = points  # without the stock
+    if allowance_mm:
+        surface_points = without_stock(model, points, select(batch, 0), allowance_mm)
     for step in range(max_iterations):
-        now = model.residuals(batch, bare)
-        columns = now.jacobian[0]
+        residuals = model.residuals(batch, surface_points)
+        columns = residuals.jacobian[0]
         if max_allowance_mm:
             columns = np.column_stack([columns, np.ones(len(points))])
-        cosine = np.maximum(now.cosine[0], LEAST_COSINE)
-        along = now.deviation_mm[0] / cosine
+        cosine = np.maximum(residuals.cosine[0], LEAST_COSINE)
+        along = residuals.deviation_mm[0] / cosine
         if step < NOISE_FITS:  # then fixed: pose and noise would follow each other round
-            noise = fit_noise(now)
+            noise = fit_noise(residuals)
         fresh = weights(along, cosine, noise)
         # a ray that was off once stays out: else those at edges would come and go for ever
         weight = fresh if step < NOISE_FITS else np.minimum(weight, fresh)
@@ -220,26 +199,28 @@ def _polish(
         if max_allowance_mm:
             prior = (2 / max_allowance_mm) ** 2
             information[6, 6] += prior
-            gradient[6] -= prior * allowance
+            gradient[6] -= prior * allowance_mm
         delta, known = _solve(information, gradient, model.part.radius)
         information /= inflation(information, scores - scores.mean(axis=0), patches)
         batch = moved(model.part, batch, -delta[None, :6])
         if max_allowance_mm:
-            allowance += float(delta[6])
-            bare = _bare(points, allowance, now, batch)
-        if delta @ information @ delta < SETTLED**2 * len(delta):
+            allowance_mm += float(delta[6])
+            surface_points = _moved_inward(points, allowance_mm, residuals, batch)
+        if delta @ information @ delta < CONVERGED**2 * len(delta):
             converged = bool(known)
             break
-    pose_information, allowance_sigma = _without_allowance(information)
-    return _Polished(
-        part_from_camera=batch,
+    pose_information, allowance_sigma_mm = _without_allowance(information)
+    return Refinement(
+        part_from_camera=select(batch, 0),
         converged=converged,
         iterations=step + 1,
-        noise=noise,
+        method="ray casting" if isinstance(model, RayCasting) else "point to plane",
+        noise_mm=float(noise.range_mm),
+        num_points=len(points),
         num_inliers=int(np.count_nonzero(weight)),
         information=pose_information,
-        allowance_mm=allowance,
-        allowance_sigma_mm=allowance_sigma,
+        allowance_mm=allowance_mm,
+        allowance_sigma_mm=allowance_sigma_mm,
     )
 
 
@@ -250,19 +231,19 @@ def without_stock(
 
     Those of the faces that the model predicts for them under ``part_from_camera``, one pose.
     """
-    batch = RigidTransform(part_from_camera.rotation[None], part_from_camera.translation[None])
-    return _bare(points, allowance, model.residuals(batch, points), batch)
+    batch = stack(part_from_camera)
+    return _moved_inward(points, allowance, model.residuals(batch, points), batch)
 
 
-def _bare(
-    points: np.ndarray, allowance: float, now: Residuals, part_from_camera: RigidTransform
+def _moved_inward(
+    points: np.ndarray, allowance: float, residuals: Residuals, part_from_camera: RigidTransform
 ) -> np.ndarray:
     """Points [n, 3], camera frame, as if the stock were taken off along the faces' normals.
 
     To take it from the deviations would be wrong by more than the noise: where the surface is
     curved, a ray meets the CAD model elsewhere than under the stock that it ends at.
     """
-    normals = now.jacobian[0][:, 3:] @ part_from_camera.rotation[0]
+    normals = residuals.jacobian[0][:, 3:] @ part_from_camera.rotation[0]
     return points - allowance * normals
 
 

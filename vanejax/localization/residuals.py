@@ -1,9 +1,9 @@
 """What a pose predicts for every measured point, and how that changes with the pose.
 
-Two measurement models with one face. `RayCasting`: a point is a ray of known direction and range,
-and the ray cast at the CAD in the assumed pose gives the predicted range: exact correspondence,
-self-occlusion included, no search. `SurfaceMatching`: the point's foot on the CAD surface, where
-nobody knows from where the point was seen.
+Two measurement models with one interface. `RayCasting`: a point is a ray of known direction and
+range, and the ray cast at the CAD model in the assumed pose gives the predicted range: exact
+correspondence, self-occlusion included, no search. `SurfaceMatching`: the closest point of the CAD
+surface, where the sensor's place is not known.
 
 Coordinates of a small motion ``delta`` [6], everywhere in the fine registration: (rotation vector
 in rad, translation in mm) in the part's frame about the part's centre c, applied after
@@ -28,10 +28,11 @@ from vanejax.scanner.virtual_scanner import Scanner
 
 T = TypeVar("T")
 
-# How near the foot of a point on the surface is found: to a cell of a grid, to the spacing of
+# How precisely the closest point on the surface is found: to a cell of a grid, to the spacing of
 # surface samples, or on the faces themselves; each is some ten times slower than the one before.
 Precision = Literal["grid", "samples", "faces"]
 FAR = 0.15  # of the part's radius
+REACH = 0.3  # of the part's radius: how far a surface partner is sought where no ray is known
 BLOCK = 1 << 14  # rays at a time: their arrays stay in the cache
 
 
@@ -112,15 +113,15 @@ class RayCasting:
             np.empty(shape), np.empty((*shape, 6)), np.empty(shape), np.empty(shape, bool)
         )
 
-        def one(block: tuple[slice, slice]) -> None:
-            poses, some = block
-            turned = rays[some] @ part_from_camera.rotation[poses].swapaxes(-1, -2)
+        def fill(block: tuple[slice, slice]) -> None:
+            poses, chosen = block
+            turned = rays[chosen] @ part_from_camera.rotation[poses].swapaxes(-1, -2)
             origins = sensor[poses, None]
             hits = self.scanner.cast_unit(origins, turned)
             hit, normals = hits.face >= 0, hits.normals
-            predicted = np.where(hit, hits.distance_mm, range_mm[some])
+            predicted = np.where(hit, hits.distance_mm, range_mm[chosen])
             cosine = np.where(hit, -np.einsum("hni,hni->hn", normals, turned), 1.0)
-            deviation = (predicted - range_mm[some]) * cosine
+            deviation = (predicted - range_mm[chosen]) * cosine
             turned *= predicted[..., None]
             turned += origins  # now the predicted points, about the part's centre
             missed = ~hit
@@ -131,7 +132,7 @@ class RayCasting:
             out.deviation_mm[block], out.cosine[block], out.hit[block] = deviation, cosine, hit
             _jacobian(turned, normals, out.jacobian[block])
 
-        _in_parallel(one, _blocks(*shape))
+        _in_parallel(fill, _blocks(*shape))
         return out
 
 
@@ -164,19 +165,27 @@ class SurfaceMatching:
             np.broadcast_to(points, (*_batch(part_from_camera), *points.shape))
         )
         flat = moved.reshape(-1, 3)
-        found = _closest_points(self.surface, flat, "grid" if precision == "grid" else "samples")
-        offset = flat - found.points
-        deviation = np.einsum("ni,ni->n", offset, found.normals)
+        closest = _closest_points(self.surface, flat, "grid" if precision == "grid" else "samples")
+        offset = flat - closest.points
+        deviation = np.einsum("ni,ni->n", offset, closest.normals)
         distance = np.linalg.norm(offset, axis=-1)
         hit = distance < self.reach_mm
         direction = offset / np.maximum(distance, 1e-12)[:, None]
-        normals = np.where(hit[:, None], found.normals, direction).reshape(moved.shape)
+        normals = np.where(hit[:, None], closest.normals, direction).reshape(moved.shape)
         return Residuals(
             deviation_mm=np.where(hit, deviation, distance).reshape(moved.shape[:2]),
             jacobian=_jacobian(moved - self.part.center, normals, np.empty((*moved.shape[:2], 6))),
             cosine=np.ones(moved.shape[:2]),
             hit=hit.reshape(moved.shape[:2]),
         )
+
+
+def measurement_model(part: Part, sensor_origin: np.ndarray | None) -> MeasurementModel:
+    """Rays from ``sensor_origin`` [3] mm, camera frame; the surface alone where it is None."""
+    surface = Surface(part)
+    if sensor_origin is None:
+        return SurfaceMatching(surface, reach_mm=REACH * part.radius)
+    return RayCasting(Scanner(part), surface, sensor_origin)
 
 
 def moved(part: Part, part_from_camera: RigidTransform, delta: np.ndarray) -> RigidTransform:

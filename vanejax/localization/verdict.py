@@ -46,11 +46,11 @@ class Limits:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Rival:
-    """Another pose, and how it compares.
+class CompetingHypothesis:
+    """Another pose, and how it compares with the refined one.
 
     Attributes:
-      preference: standard errors by which the scan prefers the reported pose to this one.
+      preference: standard errors by which the scan prefers the refined pose to this one.
       rotation_deg, translation_mm: how far away it is.
       part_from_camera: the other pose.
     """
@@ -65,7 +65,7 @@ def judge(
     refinement: Refinement,
     verification: Verification,
     uncertainty: Uncertainty,
-    rivals: Sequence[Rival],
+    competing: Sequence[CompetingHypothesis],
     *,
     radius_mm: float,
     limits: Limits | None = None,
@@ -75,9 +75,9 @@ def judge(
     faults = _faults(refinement, verification, radius_mm, limits)
     if faults:
         return Verdict("rejected", faults[0])
-    near = [rival for rival in rivals if rival.preference < limits.least_preference]
+    near = [other for other in competing if other.preference < limits.least_preference]
     if near:
-        other = min(near, key=lambda rival: rival.preference)
+        other = min(near, key=lambda other: other.preference)
         better = "better" if len(near) == 1 else "as well or better"
         return Verdict(
             "ambiguous",

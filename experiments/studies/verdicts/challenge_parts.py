@@ -14,7 +14,9 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
 
-from experiments.studies.verdicts.symmetry import (
+from vanejax.cad.parametric_vane import GuideVaneSegment, guide_vane
+from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cad.symmetry import (
     Axis,
     cyclic,
     dihedral,
@@ -22,15 +24,12 @@ from experiments.studies.verdicts.symmetry import (
     pose_error,
     rotation_about,
 )
-from vanejax.cad.parametric_vane import GuideVaneSegment, guide_vane
-from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
 
 X, Y, Z = np.eye(3)
-ORIGIN = np.zeros(3)
 SEGMENTS = 96
-ONLY_IDENTITY = cyclic(1, Z, ORIGIN)
+ONLY_IDENTITY = cyclic(1, Z)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -76,7 +75,7 @@ class ChallengePart:
     def pose_error(self, found: RigidTransform, truth: RigidTransform) -> tuple[float, float]:
         """Degrees and mm (at the part's centre) to the nearest right pose; both part_from_camera.
 
-        See `symmetry.pose_error`.
+        See `vanejax.cad.symmetry.pose_error`.
         """
         return pose_error(
             found,
@@ -247,14 +246,14 @@ def _plate(length: float, width: float, *, extra: bool = False, shift: float = 0
 def _box_part(*, chamfer: float) -> Design:
     solid = _box((80, 60, 40), (0, 0, 0))
     if not chamfer:
-        return Design(solid, dihedral(2, Z, X, ORIGIN))
+        return Design(solid, dihedral(2, Z, X))
     bar = _box((100, chamfer * math.sqrt(2), chamfer * math.sqrt(2)), (0, 0, 0))
     return Design(solid - bar.rotate((45, 0, 0)).translate((0, 30, 20)))
 
 
 def _u_channel() -> Design:
     solid = _box((120, 50, 36), (0, 0, 18)) - _box((140, 40, 36), (0, 0, 23))
-    return Design(solid - _rods(4.5, 30, [(-40, 0, 0), (40, 0, 0)]), cyclic(2, Z, ORIGIN))
+    return Design(solid - _rods(4.5, 30, [(-40, 0, 0), (40, 0, 0)]), cyclic(2, Z))
 
 
 def _t_piece(right: float) -> Design:
@@ -265,14 +264,14 @@ def _t_piece(right: float) -> Design:
     solid += _rod(21, 10, (right - 5, 0, 0), "x") + _rod(21, 10, (5 - left, 0, 0), "x")
     solid += _rod(21, 10, (0, 0, 45))
     solid -= _rod(12, run + 2, (mid, 0, 0), "x") + _rod(12, 60, (0, 0, 30))
-    return Design(solid, cyclic(2, Z, ORIGIN) if right == left else ONLY_IDENTITY)
+    return Design(solid, cyclic(2, Z) if right == left else ONLY_IDENTITY)
 
 
 def _flange(one: float) -> Design:
     """Six bolt holes of radius 5 on a circle; the one on the x axis may differ."""
     places = _ring(6, 36)
     solid = _rod(50, 12) - _rod(20, 20) - _rods(5, 20, places[1:]) - _rod(one, 20, places[0])
-    exact = dihedral(6, Z, X, ORIGIN) if one == 5 else cyclic(2, X, ORIGIN)
+    exact = dihedral(6, Z, X) if one == 5 else cyclic(2, X)
     return Design(solid, exact)
 
 
@@ -289,8 +288,8 @@ def _gear(*, keyway: bool) -> Design:
     solid -= _rod(12, 30) + _rod(26, 10, (0, 0, 11)) + _rod(26, 10, (0, 0, -11))
     solid += _rod(18, 16) - _rod(12, 30)
     if not keyway:
-        return Design(solid, dihedral(24, Z, X, ORIGIN))
-    return Design(solid - _box((8, 6, 30), (11.4, 0, 0)), cyclic(2, X, ORIGIN))
+        return Design(solid, dihedral(24, Z, X))
+    return Design(solid - _box((8, 6, 30), (11.4, 0, 0)), cyclic(2, X))
 
 
 def _shaft(*, keyway: bool) -> Design:
@@ -310,12 +309,12 @@ def _spindle_flat() -> Design:
     solid = _rod(16, 110) + _rod(22, 14) + _rod(11, 150)
     return Design(
         solid - _box((20, 60, 30), (23, 0, 35)) - _box((20, 60, 30), (23, 0, -35)),
-        cyclic(2, X, ORIGIN),
+        cyclic(2, X),
     )
 
 
 def _cross_hole_cylinder() -> Design:
-    return Design(_rod(22, 90) - _rod(7, 60, axis="x"), dihedral(2, Z, X, ORIGIN))
+    return Design(_rod(22, 90) - _rod(7, 60, axis="x"), dihedral(2, Z, X))
 
 
 def _connecting_rod() -> Design:
@@ -324,7 +323,7 @@ def _connecting_rod() -> Design:
     solid = shank + _rod(26, 20, (-60, 0, 0)) + _rod(15, 20, (60, 0, 0))
     pocket = _polygon([(-30, -7), (40, -4), (40, 4), (-30, 7)]).extrude(6)
     solid -= pocket.translate((0, 0, 3)) + pocket.translate((0, 0, -9))
-    return Design(solid - _rod(17, 40, (-60, 0, 0)) - _rod(9, 40, (60, 0, 0)), cyclic(2, X, ORIGIN))
+    return Design(solid - _rod(17, 40, (-60, 0, 0)) - _rod(9, 40, (60, 0, 0)), cyclic(2, X))
 
 
 def _hex_nut() -> Design:
@@ -332,7 +331,7 @@ def _hex_nut() -> Design:
     # the 30 deg chamfer of a nut, both sides alike
     wide = 22.5 + 24 / math.tan(math.radians(30))
     cone = _rod(wide, 24, top=22.5) ^ _rod(22.5, 24, top=wide)
-    return Design((hexagon ^ cone) - _rod(14, 40), dihedral(6, Z, X, ORIGIN))
+    return Design((hexagon ^ cone) - _rod(14, 40), dihedral(6, Z, X))
 
 
 def _elbow() -> Design:
@@ -350,7 +349,7 @@ def _elbow() -> Design:
     solid -= bend(12) + straight(12.4, -0.5, 40)
     for y, z in ((20, 0), (-20, 0), (0, 20), (0, -20)):
         solid -= _rod(2.5, 20, (-18, 40 + y, z), "x") + _rod(2.5, 20, (40 + y, -18, z), "y")
-    return Design(solid, cyclic(2, X + Y, ORIGIN))
+    return Design(solid, cyclic(2, X + Y))
 
 
 def _pump_housing() -> Design:
@@ -406,7 +405,7 @@ def _sphere_flat() -> Design:
 def _star_knob() -> Design:
     lobes = _rods(11, 16, _ring(5, 27)) + _rod(24, 16)
     solid = lobes + _rod(13, 30, (0, 0, -15), segments=120)
-    return Design(solid - _rod(5, 40, (0, 0, -20), segments=120), cyclic(5, Z, ORIGIN))
+    return Design(solid - _rod(5, 40, (0, 0, -20), segments=120), cyclic(5, Z))
 
 
 def _separator() -> Design:
@@ -447,5 +446,5 @@ def _turbine_wheel(*, cut: bool) -> Design:
     solid = hub + _repeated(blade.rotate((17, 0, 0)), 12)
     solid -= _rod(8, 80, segments=120)
     if not cut:
-        return Design(solid, cyclic(12, Z, ORIGIN))
+        return Design(solid, cyclic(12, Z))
     return Design(solid - _box((10, 30, 60), (52, 0, 0)))

@@ -4,15 +4,14 @@ python -m experiments.verdicts [--quick] [--scans 1] [--parts NAME,...] [--senso
 
 Each part is scanned by each sensor from random rotations. The true pose and wrong ones (one pitch
 off, upside down, nearly symmetric, turned by 10 to 180 deg) are refined, and the part is sought in
-the scan of another one; every pose that results is verified and judged as `vanejax.register` does,
-against the others as rivals. Then `vanejax.register` itself is run from no guess. Results: tables,
-verdicts.json, verdicts.png and judged.json (every pose) in ``--out``.
+the scan of another one. Every pose is judged by the function of `vanejax.register`, `assess`, with
+the others as competing hypotheses. Then `vanejax.register` itself is run from no guess. Results:
+tables, verdicts.json, verdicts.png and judged.json (every pose) in ``--out``.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import time
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -29,130 +28,67 @@ from experiments.studies.verdicts.wrong_poses import (
     PosedScan,
     parts_to_pose,
     posed_scan,
-    wrong_starts,
+    wrong_poses,
 )
-from vanejax.cad.part import Part
-from vanejax.cad.surface import Surface
 from vanejax.errors import InputError
-from vanejax.localization import registration as locate
-from vanejax.localization.covariance import uncertainty
-from vanejax.localization.fine_registration import refine, subset
-from vanejax.localization.pose_result import Refinement, Verdict, Verification
-from vanejax.localization.pose_search import (
-    challenge,
-    concatenate,
-    distances,
-    distinct,
-    is_same,
-    search,
-    select,
+from vanejax.localization.assessment import (
+    MOST_HYPOTHESES,
+    Assessment,
+    assess,
+    compared_points,
+    converge_fully,
 )
-from vanejax.localization.residuals import RayCasting
-from vanejax.localization.verdict import Rival, judge
-from vanejax.localization.verification import View, evidence, verify
+from vanejax.localization.fine_registration import refine
+from vanejax.localization.pose_batch import distinct, select, stack
+from vanejax.localization.pose_result import Refinement
+from vanejax.localization.pose_search import add_symmetry_hypotheses, search
+from vanejax.localization.registration import register
+from vanejax.localization.residuals import MeasurementModel, measurement_model
+from vanejax.localization.verdict import judge
 from vanejax.plotting.canvas import save_figure
-from vanejax.rigid import RigidTransform
-from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.measured_scan import MIN_POINTS, MeasuredScan
 
 QUICK_PARTS = (VANE, "vane_4", "flange_odd_hole", "box", "wedge")
-OTHER_PART_STARTS = 150
+OTHER_PART_ROTATIONS = 150
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Assessed:
-    """What is said of one refined pose of a scan.
-
-    Attributes:
-      part_from_camera: the pose.
-      verification: of it.
-      preference: standard errors by which the scan prefers it to its best rival; inf without one.
-      verdict: with the rivals.
-      alone: the verdict as if no other pose were known.
-    """
-
-    part_from_camera: RigidTransform
-    verification: Verification
-    preference: float
-    verdict: Verdict
-    alone: Verdict
-
-
-def make_model(part: Part) -> RayCasting:
-    """Rays from the origin of the scan's frame."""
-    return RayCasting(Scanner(part), Surface(part), np.zeros(3))
-
-
-def assess(
-    model: RayCasting,
-    points: np.ndarray,
-    refined: Sequence[Refinement],
-    *,
-    rivals: Sequence[RigidTransform] = (),
-) -> list[Assessed]:
-    """Verifies refined poses and judges each with the others, and ``rivals``, as its rivals.
-
-    The steps, and the numbers of points, are those of `vanejax.localization.registration`.
-    """
-    part = model.part
-    some = points[subset(points, locate.RIVAL_POINTS, 2)]
-    # a refined pose may have slid where the scan hardly holds it: no fair rival
-    poses = _batch([*(found.part_from_camera for found in refined), *rivals])
-    poses = locate.followed(model, poses, some)
-    checked = subset(points, locate.VERIFIED_POINTS, 3)
-    few, all_checked = View(some, model.sensor_origin), View(points[checked], model.sensor_origin)
-    result = []
-    for found in refined:
-        pose = found.part_from_camera
-        tolerance = float(locate.inlier_tolerance_mm(model, _batch([pose]), some)[0])
-        turn, shift = distances(poses, pose, part)
-        others = np.flatnonzero(~is_same(turn, shift, part))
-        compared = concatenate(_batch([pose]), select(poses, others))
-        said = evidence(model, compared, some, tolerance_mm=tolerance, view=few)
-        known = [
-            Rival(said.preference(0, 1 + n), float(turn[o]), float(shift[o]), select(poses, o))
-            for n, o in enumerate(others)
-        ]
-        seen = verify(model, pose, points, checked, tolerance_mm=tolerance, view=all_checked)
-        sure = uncertainty(found, part.center)
-        with_rivals, alone = (
-            judge(found, seen, sure, told, radius_mm=part.radius) for told in (known, ())
-        )
-        best = min((rival.preference for rival in known), default=np.inf)
-        result.append(Assessed(pose, seen, best, with_rivals, alone))
-    return result
-
-
-def judged_poses(scan: PosedScan, model: RayCasting, seed: int) -> Iterator[dict[str, Any]]:
-    """A row for the true pose and for each distinct wrong pose to which a start led."""
+def judged_poses(scan: PosedScan, model: MeasurementModel, seed: int) -> Iterator[dict[str, Any]]:
+    """A row for the true pose and for each distinct wrong pose that refinement ends at."""
     rng = np.random.default_rng([seed, *scan.name.encode()])
-    kinds, starts = zip((RIGHT, scan.truth), *wrong_starts(scan, rng), strict=True)
-    refined = [refine(model, scan.points, start, seed=seed) for start in starts]
+    kinds, guesses = zip((RIGHT, scan.truth), *wrong_poses(scan, rng), strict=True)
+    refined = [refine(model, scan.points, guess, seed=seed) for guess in guesses]
     # the true pose stays in, whether it was kept or lost; what came back to it says nothing new
     kept = np.array(
-        [k for k, one in enumerate(refined) if k == 0 or not scan.is_right(one.part_from_camera)]
+        [k for k, r in enumerate(refined) if k == 0 or not scan.is_right(r.part_from_camera)]
     )
-    poses = _batch([refined[k].part_from_camera for k in kept])
+    poses = stack(*(refined[k].part_from_camera for k in kept))
     kept = kept[distinct(poses, model.part, len(kept))]
-    for k, found in zip(kept, assess(model, scan.points, [refined[k] for k in kept]), strict=True):
-        yield _row(scan, kinds[k], found, right=scan.is_right(found.part_from_camera))
+    poses = stack(*(refined[k].part_from_camera for k in kept))
+    poses = converge_fully(model, poses, compared_points(scan.points, seed))
+    for k in kept:
+        assessment = assess(model, scan.points, refined[k], poses, seed=seed)
+        right = scan.is_right(refined[k].part_from_camera)
+        yield _row(scan, kinds[k], refined[k], assessment, right=right, radius_mm=model.part.radius)
 
 
-def other_part(scan: PosedScan, name: str, model: RayCasting, seed: int) -> dict[str, Any]:
-    """A row for the best pose that the part of that name finds in the scan of another one."""
-    found = search(model, scan.points, count=OTHER_PART_STARTS, seed=seed)
-    found = challenge(model, scan.points, found, seed=seed)
-    best, *others = (found.pose(k) for k in range(min(len(found), 1 + locate.RIVALS)))
-    refined = refine(model, scan.points, best, seed=seed)
-    (assessed,) = assess(model, scan.points, [refined], rivals=others)
-    return _row(scan, OTHER_PART, assessed, right=False) | {"sought": name}
+def other_part(scan: PosedScan, name: str, model: MeasurementModel, seed: int) -> dict[str, Any]:
+    """A row for the best pose of the part of that name in the scan of another one."""
+    candidates = search(model, scan.points, count=OTHER_PART_ROTATIONS, seed=seed)
+    candidates = add_symmetry_hypotheses(model, scan.points, candidates, seed=seed)
+    refinement = refine(model, scan.points, candidates.pose(0), seed=seed)
+    others = select(candidates.part_from_camera, slice(1, 1 + MOST_HYPOTHESES))
+    others = converge_fully(model, others, compared_points(scan.points, seed))
+    assessment = assess(model, scan.points, refinement, others, seed=seed)
+    return _row(
+        scan, OTHER_PART, refinement, assessment, right=False, radius_mm=model.part.radius
+    ) | {"sought": name}
 
 
 def registered(scan: PosedScan, seed: int) -> dict[str, Any]:
-    """A row for what `vanejax.register` says from no guess."""
+    """A row for the result of `vanejax.register` from no guess."""
     began = time.perf_counter()
     measured = MeasuredScan(scan.points, None, np.zeros(3), scan.name)
-    result = locate.register(measured, scan.challenge.part, seed=seed)
+    result = register(measured, scan.challenge.part, seed=seed)
     seconds = time.perf_counter() - began
     angle, shift = scan.error(result.part_from_camera)
     return {
@@ -168,9 +104,20 @@ def registered(scan: PosedScan, seed: int) -> dict[str, Any]:
     }
 
 
-def _row(scan: PosedScan, kind: str, found: Assessed, *, right: bool) -> dict[str, Any]:
-    angle, shift = (np.nan, np.nan) if kind == OTHER_PART else scan.error(found.part_from_camera)
-    seen = found.verification
+def _row(
+    scan: PosedScan,
+    kind: str,
+    refinement: Refinement,
+    assessment: Assessment,
+    *,
+    right: bool,
+    radius_mm: float,
+) -> dict[str, Any]:
+    angle, shift = np.nan, np.nan
+    if kind != OTHER_PART:
+        angle, shift = scan.error(refinement.part_from_camera)
+    verification = assessment.verification
+    alone = judge(refinement, verification, assessment.uncertainty, (), radius_mm=radius_mm)
     return {
         "part": scan.name,
         "sensor": scan.sensor,
@@ -178,15 +125,15 @@ def _row(scan: PosedScan, kind: str, found: Assessed, *, right: bool) -> dict[st
         "right": right,
         "rotation_deg": angle,
         "translation_mm": shift,
-        "score": seen.score,
-        "inlier_share": seen.inlier_share,
-        "violation_share": seen.violation_share,
-        "unmeasured_share": seen.unmeasured_share,
-        "preference": found.preference,
-        "tolerance_mm": seen.tolerance_mm,
-        "verdict": found.verdict.status,
-        "verdict_alone": found.alone.status,
-        "reason": found.verdict.reason,
+        "score": verification.score,
+        "inlier_share": verification.inlier_share,
+        "violation_share": verification.violation_share,
+        "unmeasured_share": verification.unmeasured_share,
+        "preference": min((other.preference for other in assessment.competing), default=np.inf),
+        "tolerance_mm": verification.tolerance_mm,
+        "verdict": assessment.verdict.status,
+        "verdict_alone": alone.status,
+        "reason": assessment.verdict.reason,
     }
 
 
@@ -201,24 +148,21 @@ def measure(settings: argparse.Namespace) -> tuple[list[dict[str, Any]], list[di
         raise InputError(f"no sensor {', '.join(unknown)}; there are {', '.join(SENSORS)}")
     names = settings.parts or (QUICK_PARTS if settings.quick else (VANE, *names_of_parts()))
     parts = parts_to_pose(names)
-    models = {name: make_model(challenge.part) for name, challenge in parts.items()}
-    scans = {
-        name: [
-            posed_scan(name, challenge, models[name].scanner, sensor, settings.seed + number)
-            for sensor in settings.sensors
-            for number in range(settings.scans)
-        ]
-        for name, challenge in parts.items()
-    }
+    models = {name: measurement_model(p.part, np.zeros(3)) for name, p in parts.items()}
+    scans = [
+        posed_scan(name, part, models[name].scanner, sensor, settings.seed + number)
+        for name, part in parts.items()
+        for sensor in settings.sensors
+        for number in range(settings.scans)
+    ]
     judged, runs = [], []
-    every = [(place, scan) for place, name in enumerate(parts) for scan in scans[name]]
-    for place, scan in tqdm(every, "judging", unit="scan"):
+    for scan in tqdm(scans, "judging", unit="scan"):
         if len(scan.points) < 2 * MIN_POINTS:
             continue
         judged += judged_poses(scan, models[scan.name], settings.seed)
         runs.append(registered(scan, settings.seed))
-        for other in other_parts(place, list(parts)):
-            judged.append(other_part(scan, other, models[other], settings.seed))
+        for name in other_parts(list(parts).index(scan.name), list(parts)):
+            judged.append(other_part(scan, name, models[name], settings.seed))
     return judged, runs
 
 
@@ -232,17 +176,10 @@ def other_parts(place: int, names: Sequence[str]) -> list[str]:
     return [names[(place + step) % count] for step in sorted(steps)]
 
 
-def _batch(poses: Sequence[RigidTransform]) -> RigidTransform:
-    return RigidTransform(
-        np.stack([pose.rotation for pose in poses]), np.stack([pose.translation for pose in poses])
-    )
-
-
 def main(settings: argparse.Namespace) -> dict[str, Any]:
     """The study."""
     judged, runs = measure(settings)
-    method = "poses judged by ray casting"
-    head = study.header(method, settings)
+    head = study.header("poses judged by ray casting", settings)
     # a thousand poses beside the figures that sum them up
     study.save(settings.out, "judged", head | {"judged": judged})
     report = study.save(settings.out, "verdicts", head | summarize(judged, runs))

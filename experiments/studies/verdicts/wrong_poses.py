@@ -16,8 +16,8 @@ from experiments.studies.verdicts.challenge_parts import (
     challenge_parts,
 )
 from experiments.studies.verdicts.depth_camera import KINDS, measure, random_pose
-from experiments.studies.verdicts.symmetry import motion, rotation_about
 from vanejax.cad.parametric_vane import DOUBLET, guide_vane
+from vanejax.cad.symmetry import rotation_about
 from vanejax.localization.fine_registration import subset
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera
@@ -97,8 +97,8 @@ def posed_scan(
     return PosedScan(name, challenge, sensor, points, pose.inverse())
 
 
-def wrong_starts(scan: PosedScan, rng: np.random.Generator) -> Iterator[tuple[str, RigidTransform]]:
-    """Kinds of wrong poses and one part_from_camera each; a descent may lead some of them back.
+def wrong_poses(scan: PosedScan, rng: np.random.Generator) -> Iterator[tuple[str, RigidTransform]]:
+    """Kinds of wrong poses and one part_from_camera each; refinement may lead some of them back.
 
     "near symmetry": a motion that nearly maps the part to itself; "upside down": half a turn about
     a principal axis of the surface; "one pitch off": of vanes, by one or more pitches; "turned": by
@@ -117,8 +117,7 @@ def wrong_starts(scan: PosedScan, rng: np.random.Generator) -> Iterator[tuple[st
     for degrees in TURNS_DEG:
         axis = rng.standard_normal(3)
         turn = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()
-        matrix = motion(turn, part.center - turn @ part.center)
-        yield "turned", RigidTransform.from_matrix(matrix) @ scan.truth
+        yield "turned", RigidTransform(turn, part.center - turn @ part.center) @ scan.truth
 
 
 def _vane_doublet() -> ChallengePart:

@@ -9,11 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from experiments.studies.verdicts.challenge_parts import challenge_parts, names_of_parts
-from experiments.studies.verdicts.symmetry import (
-    Surface,
+from vanejax.cad.symmetry import (
+    _DenseSurface,
     cyclic,
     dihedral,
-    motion,
     pose_error,
     rotation_about,
 )
@@ -100,7 +99,7 @@ def test_symmetries_are_groups_of_rigid_motions_that_keep_the_surface(parts):
         products = np.einsum("aij,bjk->abik", group, group).reshape(-1, 1, 4, 4)
         gaps = np.abs(products - group[None]).max(axis=(2, 3)).min(axis=1)
         assert gaps.max() < 1e-9, name
-        surface = Surface(challenge.part)
+        surface = _DenseSurface(challenge.part)
         assert max(surface.mismatch_mm(m, 800) for m in group) < EXACT_MM, name
 
 
@@ -108,7 +107,7 @@ def test_a_turned_part_is_kept_by_every_turn(parts):
     for name in ("shaft", "sphere_flat"):
         challenge = parts[name]
         point, direction = challenge.continuous_axis
-        surface = Surface(challenge.part)
+        surface = _DenseSurface(challenge.part)
         for angle in (1.1, 77.7, 200.0):
             # sag of the facets: 40 (1 - cos(180 deg / 96)) = 0.02
             assert surface.mismatch_mm(rotation_about(direction, angle, point)) < 0.03, name
@@ -135,7 +134,7 @@ def test_near_symmetries_are_found_and_are_not_exact(parts, name, angles_deg):
     turns = Rotation.from_matrix(challenge.near_symmetries[:, :3, :3].reshape(-1, 3, 3))
     # a point-to-plane fit of a part to itself turns it by a degree for the feature that differs
     np.testing.assert_allclose(np.degrees(turns.magnitude()), angles_deg, atol=2.5)
-    surface = Surface(challenge.part)
+    surface = _DenseSurface(challenge.part)
     for matrix, distance in zip(
         challenge.near_symmetries, challenge.near_distances_mm, strict=True
     ):
@@ -178,7 +177,7 @@ def test_pose_error_is_the_disturbance_whichever_symmetric_answer_was_found(part
     challenge = parts[name]
     center = challenge.part.center
     turn = rotation_about(np.array([0.0, 1.0, 0.0]), 2.0, center)  # for the shaft: across its axis
-    disturbance = motion(np.eye(3), np.array([0.6, 0.0, 0.8])) @ turn
+    disturbance = RigidTransform(np.eye(3), np.array([0.6, 0.0, 0.8])).as_matrix() @ turn
     for symmetry in transforms(challenge.symmetries):
         found = symmetry @ RigidTransform.from_matrix(disturbance) @ truth
         np.testing.assert_allclose(challenge.pose_error(found, truth), (2.0, 1.0), atol=1e-6)

@@ -19,7 +19,7 @@ from experiments.studies.real_scans.study import (
 )
 from experiments.studies.verdicts.challenge_parts import challenge_parts
 from experiments.studies.verdicts.depth_camera import measure, random_pose
-from experiments.studies.verdicts.symmetry import motion, rotation_about
+from vanejax.cad.symmetry import rotation_about
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.virtual_scanner import Scanner
@@ -82,7 +82,9 @@ def known(poses: np.ndarray) -> Known:
 
 
 def test_the_error_is_that_to_the_nearest_right_pose() -> None:
-    truth = motion(Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), np.array([5.0, 6.0, -300.0]))
+    truth = RigidTransform(
+        Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), np.array([5.0, 6.0, -300.0])
+    ).as_matrix()
     other = truth @ rotation_about(np.array([0.0, 0.0, 1.0]), 180.0, np.zeros(3))
     shifted = truth.copy()
     shifted[:3, 3] += [3.0, 0.0, 4.0]

@@ -13,9 +13,7 @@ from experiments.studies.verdicts.report import area_under_roc, picture, roc, su
 from experiments.studies.verdicts.study import (
     OTHER_PART,
     RIGHT,
-    assess,
     main,
-    make_model,
     make_parser,
     other_parts,
 )
@@ -27,12 +25,14 @@ from experiments.studies.verdicts.wrong_poses import (
     PosedScan,
     parts_to_pose,
     posed_scan,
-    wrong_starts,
+    wrong_poses,
 )
 from vanejax.errors import InputError
+from vanejax.localization.assessment import assess
 from vanejax.localization.fine_registration import refine
+from vanejax.localization.pose_batch import stack
 from vanejax.localization.registration import register
-from vanejax.localization.residuals import RayCasting
+from vanejax.localization.residuals import RayCasting, measurement_model
 from vanejax.rigid import RigidTransform
 from vanejax.scans.measured_scan import MeasuredScan
 
@@ -44,7 +44,7 @@ def parts():
 
 @pytest.fixture(scope="module")
 def model(parts) -> RayCasting:
-    return make_model(parts[VANE].part)
+    return measurement_model(parts[VANE].part, np.zeros(3))
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_scans_lie_on_the_part(parts, model: RayCasting, sensor: str) -> None:
 
 def test_wrong_poses_are_wrong(scan: PosedScan) -> None:
     kinds = []
-    for kind, pose in wrong_starts(scan, np.random.default_rng(0)):
+    for kind, pose in wrong_poses(scan, np.random.default_rng(0)):
         kinds.append(kind)
         assert not scan.is_right(pose), kind
     assert set(kinds) >= {"one pitch off", "upside down", "turned"}
@@ -95,7 +95,7 @@ def test_wrong_poses_are_wrong(scan: PosedScan) -> None:
 
 
 def test_a_pitch_is_the_distance_of_the_vanes(scan: PosedScan) -> None:
-    starts = wrong_starts(scan, np.random.default_rng(0))
+    starts = wrong_poses(scan, np.random.default_rng(0))
     for pose in [pose for kind, pose in starts if kind == "one pitch off"]:
         turn, _ = scan.error(pose)
         assert turn == pytest.approx(360 / 54, abs=1e-6)
@@ -120,7 +120,7 @@ def test_a_pose_is_judged_as_register_judges_it(parts, model: RayCasting, scan: 
     measured = MeasuredScan(scan.points, None, np.zeros(3), "scan")
     result = register(measured, parts[VANE].part)
     again = refine(model, scan.points, result.part_from_camera)
-    (found,) = assess(model, scan.points, [again])
+    found = assess(model, scan.points, again, stack(again.part_from_camera))
     theirs, mine = result.verification, found.verification
     # the pose moves by a fraction of its noise when refined once more
     assert mine.tolerance_mm == pytest.approx(theirs.tolerance_mm, rel=1e-2)
@@ -129,25 +129,23 @@ def test_a_pose_is_judged_as_register_judges_it(parts, model: RayCasting, scan: 
     assert mine.unmeasured_share == pytest.approx(theirs.unmeasured_share, abs=5e-3)
     assert mine.score == pytest.approx(theirs.score, abs=1e-2)
     assert found.verdict.status == result.verdict.status == "accepted"
-    assert found.preference == np.inf
+    assert found.competing == ()
 
 
-def test_rivals_count(model: RayCasting, scan: PosedScan) -> None:
+def test_competing_hypotheses_count(model: RayCasting, scan: PosedScan) -> None:
     ends = [
         refine(model, scan.points, pose)
-        for kind, pose in wrong_starts(scan, np.random.default_rng(0))
+        for kind, pose in wrong_poses(scan, np.random.default_rng(0))
         if kind == "upside down"
     ]
     wrong = next(end for end in ends if not scan.is_right(end.part_from_camera))
-    right, off = assess(model, scan.points, [refine(model, scan.points, scan.truth), wrong])
+    true = refine(model, scan.points, scan.truth)
+    poses = stack(true.part_from_camera, wrong.part_from_camera)
+    right, off = (assess(model, scan.points, end, poses) for end in (true, wrong))
     assert right.verdict.status == "accepted"
     assert off.verdict.status != "accepted"
-    assert right.preference > 4
-    assert off.preference < 0
-    (alone,) = assess(model, scan.points, [wrong])
-    assert alone.preference == np.inf
-    (known,) = assess(model, scan.points, [wrong], rivals=[scan.truth])
-    assert known.preference < 0
+    assert right.competing[0].preference > 4
+    assert off.competing[0].preference < 0
 
 
 def judged(kind: str, score: float, verdict: str, *, right: bool = False) -> dict:

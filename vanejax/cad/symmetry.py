@@ -1,4 +1,4 @@
-"""Symmetries of parts: exact ones by name, near ones by search, and pose errors modulo both.
+"""Symmetries of parts: exact groups, near ones by search, and pose errors modulo symmetry.
 
 Every symmetry is a proper rigid motion of the part's own frame, [4, 4] f64 in mm, that maps the
 surface to itself. A pose part_from_camera is then as right as ``symmetry @ part_from_camera``.
@@ -17,6 +17,7 @@ from vanejax.rigid import RigidTransform
 
 Axis = tuple[np.ndarray, np.ndarray]
 
+ORIGIN = np.zeros(3)
 SURFACE_SAMPLES, SAMPLES_PER_QUERY = 60_000, 3
 SCREENED_POINTS, POLISHED_POINTS, SCORED_POINTS = 150, 400, 2000
 POLISHING_STEPS = 6
@@ -27,28 +28,23 @@ def rotation_about(axis: np.ndarray, angle_deg: float, point: np.ndarray) -> np.
     """[4, 4]: right-handed turn about the line through ``point`` [3] along ``axis`` [3]."""
     axis = np.asarray(axis, np.float64)
     turn = Rotation.from_rotvec(math.radians(angle_deg) * axis / np.linalg.norm(axis)).as_matrix()
-    return motion(turn, np.asarray(point, np.float64) - turn @ np.asarray(point, np.float64))
+    return RigidTransform(turn, point - turn @ point).as_matrix()
 
 
-def motion(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """[4, 4] from [3, 3] and [3]."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    return matrix
-
-
-def cyclic(order: int, axis: np.ndarray, point: np.ndarray) -> np.ndarray:
+def cyclic(order: int, axis: np.ndarray, point: np.ndarray = ORIGIN) -> np.ndarray:
     """The group C_n [n, 4, 4]: turns by 360/n deg about a line; the identity comes first."""
     return np.stack([rotation_about(axis, 360 * i / order, point) for i in range(order)])
 
 
-def dihedral(order: int, axis: np.ndarray, flip: np.ndarray, point: np.ndarray) -> np.ndarray:
+def dihedral(
+    order: int, axis: np.ndarray, flip: np.ndarray, point: np.ndarray = ORIGIN
+) -> np.ndarray:
     """The group D_n [2n, 4, 4]: C_n about ``axis``, and half turns like that about ``flip``."""
     turns = cyclic(order, axis, point)
     return np.concatenate([turns, turns @ rotation_about(flip, 180, point)])
 
 
-class Surface:
+class _DenseSurface:
     """Distances to a part's surface by dense samples that stand for small discs.
 
     A sample counts as a disc of its normal with as much radius as samples are apart, so a part's
@@ -94,11 +90,12 @@ class Surface:
             # the cut-off keeps still what the surface does not hold, as a turned part's angle
             step = np.linalg.lstsq(jacobian, residual, rcond=1e-2)[0]
             turn = Rotation.from_rotvec(step[:3] / self.part.radius).as_matrix()
-            matrix = motion(turn, middle - turn @ middle + step[3:]) @ matrix
+            step = RigidTransform(turn, middle - turn @ middle + step[3:])
+            matrix = step.as_matrix() @ matrix
         return matrix
 
 
-def candidates(part: Part) -> np.ndarray:
+def _candidates(part: Part) -> np.ndarray:
     """Rotations [K, 4, 4] about the surface's centroid among which near symmetries are sought.
 
     Multiples of 15 deg about the part's and the surface's principal axes, alone and after a half
@@ -117,7 +114,7 @@ def candidates(part: Part) -> np.ndarray:
             turns += [about.as_matrix(), (about * flip).as_matrix()]
         turns.append(frame @ Rotation.create_group("I").as_matrix() @ frame.T)
     rotations = _different(np.concatenate(turns))
-    return np.stack([motion(r, center - r @ center) for r in rotations])
+    return RigidTransform(rotations, center - rotations @ center).as_matrix()
 
 
 def _different(rotations: np.ndarray) -> np.ndarray:
@@ -151,7 +148,7 @@ def near_symmetries(
     Returns:
       Motions [M, 4, 4] and their symmetric mean surface distances [M] in mm, ascending.
     """
-    surface, limit = Surface(part), largest_share * part.radius
+    surface, limit = _DenseSurface(part), largest_share * part.radius
     found: list[tuple[float, np.ndarray]] = []
     tried: list[np.ndarray] = []
 
@@ -172,7 +169,7 @@ def near_symmetries(
     def coarse(matrix: np.ndarray) -> float:
         return surface.mismatch_mm(matrix, POLISHED_POINTS)
 
-    every = candidates(part) if more is None else np.concatenate([candidates(part), more])
+    every = _candidates(part) if more is None else np.concatenate([_candidates(part), more])
     for matrix in every:
         # what is far off before the polish will not come near enough by it
         if surface.mismatch_mm(matrix, SCREENED_POINTS) > 3 * limit:

@@ -29,8 +29,7 @@ from scipy.spatial.transform import Rotation
 import vanejax
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
-from vanejax.localization import matched_poses
-from vanejax.localization import registration as locate
+from vanejax.localization import assessment, matched_poses, registration
 from vanejax.localization.pose_result import PoseResult
 from vanejax.localization.registration import register
 from vanejax.localization.verdict import Limits
@@ -359,7 +358,7 @@ def test_what_the_network_finds_is_followed(monkeypatch):
         return batch(disturbed(bracket(), truth, 3, 3, seed=0))
 
     monkeypatch.setattr(matched_poses, "match_poses", good)
-    monkeypatch.setattr(locate, "STARTS", ())  # no search by ray casting
+    monkeypatch.setattr(registration, "SEARCH_ROTATIONS", ())  # no search by ray casting
     result = register(points, bracket(), weights=a_matcher(bracket()))
     assert_right(result, bracket(), truth)
     assert asked == [60]
@@ -508,8 +507,8 @@ def test_the_pose_near_the_guess_is_judged_though_a_far_one_fits_better():
     guess = motion(part, [0, 0, 180.0], np.zeros(3)) @ truth
     result = register(points, part, init=guess)
     turned, moved_by = pose_error(part, result.part_from_camera, guess)
-    assert turned < locate.GUESS_DEG
-    assert moved_by < locate.GUESS_SHIFT * part.radius
+    assert turned < assessment.GUESS_DEG
+    assert moved_by < assessment.GUESS_SHIFT * part.radius
     assert result.verdict.status == "ambiguous"
     nearest = min(pose_error(part, a.part_from_camera, truth)[0] for a in result.alternatives)
     assert nearest < 0.5  # the true pose, followed with a part of the points
@@ -527,8 +526,8 @@ def test_a_weakly_supported_pose_is_no_reason_to_stop(second, monkeypatch):
         )
 
     results = {0.5: supported(0.5), second: supported(second)}
-    monkeypatch.setattr(locate, "_sources", lambda *_: iter([0.5, second]))
-    monkeypatch.setattr(locate, "_finish", lambda model, scan, found, *_: results[found])
+    monkeypatch.setattr(registration, "_search", lambda *_: iter([0.5, second]))
+    monkeypatch.setattr(registration, "_localize", lambda model, scan, found, *_: results[found])
     points, _ = scan_of("bracket", 1)
     found = register(points, bracket(), sensor_origin=np.zeros(3))
     assert found is results[max(0.5, second)]

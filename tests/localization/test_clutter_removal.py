@@ -21,8 +21,8 @@ from example_scans import (
 
 from vanejax.cli.program import main
 from vanejax.errors import InputError
-from vanejax.localization import clutter_removal as foreign_points
-from vanejax.localization.clutter_removal import attempts, with_others, without_others
+from vanejax.localization import clutter_removal
+from vanejax.localization.clutter_removal import segmentations, with_clutter, without_clutter
 from vanejax.localization.pose_result import PoseResult
 from vanejax.localization.registration import register
 from vanejax.machine.pose_file import read_pose
@@ -117,23 +117,23 @@ def test_without_clutter_nothing_changes(when):
     ],
 )
 def test_the_likelier_is_tried_first(when, larger, segments, expected, monkeypatch):
-    monkeypatch.setattr(foreign_points, "is_larger", lambda *_: larger)
-    monkeypatch.setattr(foreign_points, "segment", lambda *_, **__: segments)
+    monkeypatch.setattr(clutter_removal, "is_larger", lambda *_: larger)
+    monkeypatch.setattr(clutter_removal, "segment", lambda *_, **__: segments)
     scan = MeasuredScan(np.zeros((len(segments.label), 3)), None, np.zeros(3))
-    tried = list(attempts(scan, vane(), when))
+    tried = list(segmentations(scan, vane(), when))
     assert "".join("w" if attempt is None else "s" for attempt in tried) == expected
 
 
 def test_a_clean_scan_that_is_right_is_not_taken_apart(monkeypatch):
     points, _ = measured_points(vane())
-    monkeypatch.setattr(foreign_points, "segment", None)
+    monkeypatch.setattr(clutter_removal, "segment", None)
     scan = clean_scan(points)
-    assert next(attempts(scan, vane(), "auto")) is None
+    assert next(segmentations(scan, vane(), "auto")) is None
 
 
 def test_a_word_that_is_none():
     with pytest.raises(InputError, match="segment"):
-        next(attempts(cluttered()[0], vane(), "perhaps"))
+        next(segmentations(cluttered()[0], vane(), "perhaps"))
 
 
 # --- what is left out ---------------------------------------------------------------------------
@@ -144,7 +144,7 @@ def test_only_the_parts_points_are_kept():
     normals = np.tile(np.float32([0, 0, 1]), (len(scan.points), 1))
     label = np.zeros(len(scan.points), np.uint8)
     label[::3], label[1::3] = Segment.TABLE, Segment.OTHER
-    some = without_others(dataclasses.replace(scan, normals=normals), Segments(label, ()))
+    some = without_clutter(dataclasses.replace(scan, normals=normals), Segments(label, ()))
     np.testing.assert_array_equal(some.points, scan.points[2::3])
     assert some.normals.shape == some.points.shape
     assert f"{np.sum(label == 1):,} were taken away as a table" in some.notes[-1]
@@ -158,13 +158,13 @@ def test_a_table_seen_through_the_part_rejects_the_pose():
     result = dataclasses.replace(found(), part_from_camera=aside)
     indices = dataclasses.replace(result.verification, checked=np.arange(100))
     result = dataclasses.replace(result, verification=indices)
-    wrong = with_others(result, scan, segments, model(vane()))
+    wrong = with_clutter(result, scan, segments, model(vane()))
     assert wrong.verdict.status == "rejected"
     assert "through" in wrong.verdict.reason
     now = model(vane()).residuals(batch(aside), scan.points[~mine])
     behind = now.hit & (now.deviation_mm < -result.verification.tolerance_mm)
     assert f"{behind.sum() / mine.sum():.0%}" in wrong.verdict.reason
-    right = with_others(
+    right = with_clutter(
         dataclasses.replace(result, part_from_camera=truth), scan, segments, model(vane())
     )
     assert right.verdict is result.verdict
@@ -178,7 +178,7 @@ def test_of_rays_that_are_not_known_nothing_is_said():
     result = dataclasses.replace(found(), part_from_camera=aside, sensor_origin=None)
     indices = dataclasses.replace(result.verification, checked=np.arange(100))
     result = dataclasses.replace(result, verification=indices)
-    assert with_others(result, scan, segments, model(vane())).verdict is result.verdict
+    assert with_clutter(result, scan, segments, model(vane())).verdict is result.verdict
 
 
 def test_the_command_takes_the_part_out_of_its_scene(tmp_path, capsys) -> None:

@@ -25,7 +25,7 @@ from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.localization.covariance import uncertainty
-from vanejax.localization.fine_registration import descend, refine, subset
+from vanejax.localization.fine_registration import refine, robust_gauss_newton, subset
 from vanejax.localization.residuals import RayCasting, SurfaceMatching
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import look_at
@@ -255,14 +255,14 @@ def test_from_far_away_the_residuals_tell(exact, turn_deg):
         assert not good
 
 
-# --- descend ------------------------------------------------------------------------------------
+# --- robust Gauss-Newton ---------------------------------------------------------------------------
 
 
 def test_descend_takes_each_pose_of_a_batch_home(exact):
     points, truth = exact
     starts = [disturbed(vane(), truth, 10, 5, seed) for seed in range(4)]
-    found, iterations = descend(model(vane()), batch(*starts), points, iterations=20)
-    alone, _ = descend(model(vane()), batch(starts[2]), points, iterations=20)
+    found, iterations = robust_gauss_newton(model(vane()), batch(*starts), points, iterations=20)
+    alone, _ = robust_gauss_newton(model(vane()), batch(starts[2]), points, iterations=20)
     assert iterations == 20
     for k in range(4):
         pose = RigidTransform(found.rotation[k], found.translation[k])
@@ -272,7 +272,9 @@ def test_descend_takes_each_pose_of_a_batch_home(exact):
 
 def test_descend_stops_where_nothing_moves(exact):
     points, truth = exact
-    _, iterations = descend(model(vane()), batch(truth), points, iterations=20, settled_deg=0.1)
+    _, iterations = robust_gauss_newton(
+        model(vane()), batch(truth), points, iterations=20, min_step_deg=0.1
+    )
     assert iterations == 1
 
 

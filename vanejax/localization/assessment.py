@@ -1,0 +1,224 @@
+"""How a refined pose is judged: the one way, of `register` and of the study of its verdicts.
+
+The poses that compete with it are compared by the same points, each of the scan's points says
+whether it lies on the part, and the covariance says how well the scan fixes the pose.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vanejax.localization.covariance import uncertainty
+from vanejax.localization.fine_registration import robust_gauss_newton, subset, without_stock
+from vanejax.localization.pose_batch import concatenate, distances, distinct, is_same, select, stack
+from vanejax.localization.pose_result import (
+    Alternative,
+    Refinement,
+    Uncertainty,
+    Verdict,
+    Verification,
+)
+from vanejax.localization.pose_search import Candidates, add_symmetry_hypotheses, noise_level
+from vanejax.localization.residuals import MeasurementModel
+from vanejax.localization.scan_patches import view_of
+from vanejax.localization.verdict import CompetingHypothesis, Limits, judge
+from vanejax.localization.verification import evidence, verify
+from vanejax.rigid import RigidTransform
+
+MOST_HYPOTHESES = 8  # poses beside the best that are converged and compared with it
+COMPARED_POINTS = 8_000
+VERIFIED_POINTS = 100_000
+# of the part's radius: a casting is no truer to its model than the first, and what is farther off
+# than the second is not on the part
+LEAST_TOLERANCE, MOST_TOLERANCE = 0.001, 0.12
+# a guess is good to this; a pose farther away that fits as well is no reason to doubt it
+GUESS_DEG, GUESS_SHIFT = 30.0, 0.3
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Assessment:
+    """What is known of one refined pose of a scan.
+
+    Attributes:
+      verification: what every checked point says.
+      uncertainty: covariance and its weakest directions.
+      competing: the other poses and how much less the scan prefers them.
+      ruled_out: poses that fit as well, but are far from the guess; none of ``competing``.
+      alternatives: of ``competing``, those that the scan allows, best first; of an ambiguous pose.
+      verdict: on the pose.
+    """
+
+    verification: Verification
+    uncertainty: Uncertainty
+    competing: tuple[CompetingHypothesis, ...]
+    ruled_out: tuple[CompetingHypothesis, ...]
+    alternatives: tuple[Alternative, ...]
+    verdict: Verdict
+
+
+def compared_points(points: np.ndarray, seed: int) -> np.ndarray:
+    """Those of the points [N, 3] by which poses are compared."""
+    return points[subset(points, COMPARED_POINTS, seed + 2)]
+
+
+def competing_hypotheses(
+    model: MeasurementModel, points: np.ndarray, candidates: Candidates, *, seed: int = 0
+) -> Candidates:
+    """The best candidates and symmetry hypotheses, converged and scored by the same points.
+
+    Not sorted, nor are poses that met left out: see `choose`.
+    """
+    pool = add_symmetry_hypotheses(model, points, candidates, seed=seed)
+    sample = compared_points(points, seed)
+    poses = select(pool.part_from_camera, slice(0, 1 + MOST_HYPOTHESES))
+    poses = converge_fully(model, poses, sample)
+    tolerance = float(inlier_tolerance_mm(model, poses, sample).min())
+    view = view_of(model, sample)
+    score = evidence(model, poses, sample, tolerance_mm=tolerance, view=view).total
+    return Candidates(poses, score)
+
+
+def choose(
+    model: MeasurementModel, hypotheses: Candidates, guess: RigidTransform | None = None
+) -> RigidTransform:
+    """Distinct poses [H, 3, 3] in the order in which they are tried: near the guess, then score."""
+    poses, score = hypotheses.part_from_camera, hypotheses.score
+    far = np.zeros(len(score), bool)
+    if guess is not None:
+        far = ~_is_near_guess(*distances(poses, guess, model.part), model)
+    order = np.lexsort((-score, far))  # the last key counts most
+    return select(poses, order[distinct(select(poses, order), model.part, len(order))])
+
+
+def assess(
+    model: MeasurementModel,
+    points: np.ndarray,
+    refinement: Refinement,
+    hypotheses: RigidTransform,
+    *,
+    guess: RigidTransform | None = None,
+    limits: Limits | None = None,
+    seed: int = 0,
+) -> Assessment:
+    """Verifies a refined pose, compares it with hypotheses, and judges it.
+
+    Args:
+      model: predicts points.
+      points: [N, 3] f64, mm, camera frame.
+      refinement: of these points.
+      hypotheses: [H, 3, 3] and [H, 3], from `converge_fully`; those that are the pose do not count.
+      guess: rough part_from_camera; hypotheses far from it count where they fit better only.
+      limits: of the verdict.
+      seed: of the subsets of points.
+    """
+    limits = limits or Limits()
+    part, pose = model.part, refinement.part_from_camera
+    sample = compared_points(points, seed)
+    tolerance = float(inlier_tolerance_mm(model, stack(pose), sample)[0])
+    competing, ruled_out = _compare(
+        model, sample, concatenate(stack(pose), hypotheses), tolerance, guess, limits
+    )
+    verification = _verify(model, points, refinement, tolerance, seed)
+    sigma = uncertainty(refinement, part.center)
+    verdict = judge(
+        refinement, verification, sigma, competing, radius_mm=part.radius, limits=limits
+    )
+    alternatives = ()
+    if verdict.status == "ambiguous":
+        allowed = [other for other in competing if other.preference < limits.least_preference]
+        allowed.sort(key=lambda other: other.preference)
+        alternatives = tuple(_alternative(model, other, sample, tolerance) for other in allowed)
+    return Assessment(verification, sigma, competing, ruled_out, alternatives, verdict)
+
+
+def converge_fully(
+    model: MeasurementModel, poses: RigidTransform, points: np.ndarray
+) -> RigidTransform:
+    """H poses [H, 3, 3] where they explain the points [n, 3] best: to be compared with others.
+
+    A pose from `refine` may have slid where the scan hardly holds it, and is compared after this.
+    """
+    return robust_gauss_newton(
+        model,
+        poses,
+        points,
+        iterations=8,
+        precision="samples",
+        floor_mm=LEAST_TOLERANCE * model.part.radius,
+        min_step_deg=0.02,
+    )[0]
+
+
+def inlier_tolerance_mm(
+    model: MeasurementModel, poses: RigidTransform, points: np.ndarray
+) -> np.ndarray:
+    """[H] largest deviation of an inlier, mm: three robust standard deviations, within bounds."""
+    radius = model.part.radius
+    level = 3 * noise_level(model, poses, points)
+    return np.clip(level, LEAST_TOLERANCE * radius, MOST_TOLERANCE * radius)
+
+
+def _compare(
+    model: MeasurementModel,
+    points: np.ndarray,
+    poses: RigidTransform,
+    tolerance_mm: float,
+    guess: RigidTransform | None,
+    limits: Limits,
+) -> tuple[tuple[CompetingHypothesis, ...], tuple[CompetingHypothesis, ...]]:
+    """The poses that compete with the first one, and those that only the guess rules out."""
+    view = view_of(model, points)
+    scores = evidence(model, poses, points, tolerance_mm=tolerance_mm, view=view)
+    angle_deg, shift_mm = distances(poses, select(poses, 0), model.part)
+    near_guess = np.ones(len(angle_deg), bool)
+    if guess is not None:
+        near_guess = _is_near_guess(*distances(poses, guess, model.part), model)
+    competing, ruled_out = [], []
+    for k in np.flatnonzero(~is_same(angle_deg, shift_mm, model.part)):
+        other = CompetingHypothesis(
+            scores.preference(0, k), float(angle_deg[k]), float(shift_mm[k]), select(poses, k)
+        )
+        if near_guess[k] or other.preference <= -limits.least_preference:
+            competing.append(other)
+        elif other.preference < limits.least_preference:
+            ruled_out.append(other)
+    return tuple(competing), tuple(ruled_out)
+
+
+def _verify(
+    model: MeasurementModel,
+    points: np.ndarray,
+    refinement: Refinement,
+    tolerance_mm: float,
+    seed: int,
+) -> Verification:
+    """What the points say: of a casting, whether the part is there under its stock."""
+    pose = refinement.part_from_camera
+    checked = subset(points, VERIFIED_POINTS, seed + 3)
+    if refinement.allowance_mm:
+        points = without_stock(model, points, pose, refinement.allowance_mm)
+        tolerance_mm = float(inlier_tolerance_mm(model, stack(pose), points[checked])[0])
+    view = view_of(model, points[checked])
+    return verify(model, pose, points, checked, tolerance_mm=tolerance_mm, view=view)
+
+
+def _is_near_guess(
+    angle_deg: np.ndarray, shift_mm: np.ndarray, model: MeasurementModel
+) -> np.ndarray:
+    return (angle_deg <= GUESS_DEG) & (shift_mm <= GUESS_SHIFT * model.part.radius)
+
+
+def _alternative(
+    model: MeasurementModel, other: CompetingHypothesis, points: np.ndarray, tolerance_mm: float
+) -> Alternative:
+    """A competing hypothesis as the result lists it."""
+    pose = stack(other.part_from_camera)
+    deviation = model.residuals(pose, points, precision="samples").deviation_mm
+    return Alternative(
+        part_from_camera=other.part_from_camera,
+        rotation_deg=other.rotation_deg,
+        translation_mm=other.translation_mm,
+        inlier_share=float(np.mean(np.abs(deviation) <= tolerance_mm)),
+    )
