@@ -255,7 +255,7 @@ def test_from_far_away_the_residuals_tell(exact, turn_deg):
         assert not good
 
 
-# --- robust Gauss-Newton ---------------------------------------------------------------------------
+# --- robust Gauss-Newton --------------------------------------------------------------------------
 
 
 def test_descend_takes_each_pose_of_a_batch_home(exact):

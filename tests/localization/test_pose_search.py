@@ -53,7 +53,7 @@ def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("count", "cover_deg"), [(400, 34.0), (1200, 24.0)])
-def test_spread_rotations_cover_all_rotations(count, cover_deg):
+def test_uniform_rotations_cover_all_rotations(count, cover_deg):
     """``count`` balls of angle t hold all of SO(3) where count (t - sin t) = pi: 20.7, 14.3 deg.
 
     Balls that cover it overlap, so they are larger: half as large again is a good cover.
@@ -131,10 +131,10 @@ def test_concatenate_and_select_are_each_others_inverse():
     np.testing.assert_array_equal(found.pose(1).rotation, a.rotation[1])
 
 
-# --- challengers --------------------------------------------------------------------------------
+# --- symmetry hypotheses -------------------------------------------------------------------------
 
 
-def test_challengers_of_a_box_are_its_symmetries():
+def test_symmetry_hypotheses_of_a_box_are_its_symmetries():
     best = random_view(box(), seed=3).inverse()
     tried = symmetry_hypotheses(model(box()).surface, best)
     for axis in np.eye(3):
@@ -143,7 +143,7 @@ def test_challengers_of_a_box_are_its_symmetries():
         assert np.min(angle + shift) < 1e-4  # exact moments; vertices are float32
 
 
-def test_challengers_of_a_cube_are_quarter_turns_too():
+def test_symmetry_hypotheses_of_a_cube_are_quarter_turns_too():
     """A cube has no principal axes of its own; a square prism has one, and turns about that."""
     prism = box(40.0, 40.0, 90.0)
     best = random_view(prism, seed=3).inverse()
@@ -153,7 +153,7 @@ def test_challengers_of_a_cube_are_quarter_turns_too():
         assert np.min(angle + shift) < 1e-4
 
 
-def test_challengers_are_shifted_along_the_axes():
+def test_symmetry_hypotheses_are_shifted_along_the_axes():
     best = random_view(box(), seed=3).inverse()
     tried = symmetry_hypotheses(model(box()).surface, best)
     for axis, length in enumerate((80.0, 50.0, 30.0)):

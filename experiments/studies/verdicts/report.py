@@ -21,7 +21,7 @@ FIGURES = {
     "inlier_share": "inlier share",
     "violation_share": "free-space violations (negative)",
     "unmeasured_share": "unmeasured surface (negative)",
-    "preference": "preference to the best rival",
+    "preference": "preference to the best other",
 }
 NEGATIVE = ("violation_share", "unmeasured_share")
 
@@ -120,7 +120,7 @@ def summarize(
 
 
 def _verdicts(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Counts of the verdicts, with rivals and alone."""
+    """Counts of the verdicts, with competing hypotheses and without."""
     count = Counter(row["verdict"] for row in rows)
     alone = Counter(row["verdict_alone"] for row in rows)
     return {status: count[status] for status in STATUSES} | {"accepted_alone": alone["accepted"]}
@@ -155,7 +155,7 @@ def table(report: Mapping[str, Any]) -> str:
         rate = row["true_accepts_at_no_false"]
         lines.append(f"  {FIGURES[name]:<32}{row['auc']:>8.3f}{cells}{rate:>21.1%}")
     head = "".join(f"{status:>11}" for status in STATUSES)
-    lines += ["", f"{'verdict on poses':<34}{head}{'accepted without rivals':>25}"]
+    lines += ["", f"{'verdict on poses':<34}{head}{'accepted without others':>25}"]
     rows = list(report["verdicts_by_kind"].items())
     for sensor, words in report["verdicts_by_sensor"].items():
         rows += [(f"{sensor}, {word}", count) for word, count in words.items()]

@@ -39,7 +39,7 @@ from vanejax.localization.assessment import (
     converge_fully,
 )
 from vanejax.localization.fine_registration import refine
-from vanejax.localization.pose_batch import distinct, select, stack
+from vanejax.localization.pose_batch import concatenate, distinct, select, stack
 from vanejax.localization.pose_result import Refinement
 from vanejax.localization.pose_search import add_symmetry_hypotheses, search
 from vanejax.localization.registration import register
@@ -77,8 +77,9 @@ def other_part(scan: PosedScan, name: str, model: MeasurementModel, seed: int) -
     candidates = add_symmetry_hypotheses(model, scan.points, candidates, seed=seed)
     refinement = refine(model, scan.points, candidates.pose(0), seed=seed)
     others = select(candidates.part_from_camera, slice(1, 1 + MOST_HYPOTHESES))
-    others = converge_fully(model, others, compared_points(scan.points, seed))
-    assessment = assess(model, scan.points, refinement, others, seed=seed)
+    poses = concatenate(stack(refinement.part_from_camera), others)
+    poses = converge_fully(model, poses, compared_points(scan.points, seed))
+    assessment = assess(model, scan.points, refinement, poses, seed=seed)
     return _row(
         scan, OTHER_PART, refinement, assessment, right=False, radius_mm=model.part.radius
     ) | {"sought": name}
