@@ -75,6 +75,33 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         raise InputError(f"{path}: cannot be read as JSON ({error})") from error
 
 
+def read_head(path: Path, *, max_bytes: int, advice: str) -> bytes:
+    """The first 64 KiB of a file.
+
+    Raises:
+      InputError: the file is missing, a folder, a device, empty, unreadable, or larger than
+        ``max_bytes``, for which the message gives the advice.
+    """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; give the file in it")
+    if not path.exists():
+        raise InputError(f"{path}: no such file (looked in {path.parent.absolute()})")
+    if not path.is_file():
+        raise InputError(f"{path}: is a device or a pipe; give a file")
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(1 << 16)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if size > max_bytes:
+        limit = f"{size / 2**30:.1f} GiB are more than {max_bytes / 2**30:.0f} GiB"
+        raise InputError(f"{path}: {limit}; {advice}")
+    if size <= 1 << 16 and not head.strip():
+        raise InputError(f"{path}: is empty; export it again")
+    return head
+
+
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Finds out before long work whether `atomic_write` will be able to write ``path``.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,27 +17,30 @@ import trimesh
 
 from vanejax.cad.mesh_repair import MAX_FACES
 from vanejax.errors import InputError
+from vanejax.files import read_head
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "ft": 304.8, "um": 1e-3}
 """Units of length and their size in mm."""
 
-SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".gltf", ".step", ".stp")
 MAX_BYTES = 2**30
 
 # 0.01 mm between a curved face and its triangles, and 0.1 rad (6 deg) between neighbours
 _STEP_TOLERANCE = {"tol_linear": 0.01, "tol_angular": 0.1}
+_COARSER = "export it with a coarser tolerance (0.01 mm is enough)"
+
+Mesh = tuple[np.ndarray, np.ndarray, tuple[str, ...]]
+"""Vertices [V, 3] f64 in mm, faces [F, 3] i32 or i64, and a sentence per oddity passed over."""
 
 
-def read_triangles(path: Path, *, units: str) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+def read_triangles(path: Path, *, units: str) -> Mesh:
     """The triangles of a file, unchecked but for what reading needs.
 
     Args:
-      path: an STL, OBJ, PLY, GLB, GLTF or STEP file; all bodies in it are put together.
+      path: a file with a suffix of `READERS`; all bodies in it are put together.
       units: unit of the numbers in the file, a key of `MM_PER_UNIT`.
 
     Returns:
-      vertices [V, 3] f64 in mm, not necessarily finite; faces [F, 3] i32 or i64, not necessarily
-      closed; a sentence per oddity that was passed over.
+      A mesh that need not be finite or closed.
 
     Raises:
       InputError: the file is missing, empty, truncated, too large or of another kind.
@@ -44,42 +48,29 @@ def read_triangles(path: Path, *, units: str) -> tuple[np.ndarray, np.ndarray, t
     if units not in MM_PER_UNIT:
         raise InputError(f"unknown unit {units!r}; use one of {', '.join(MM_PER_UNIT)}")
     suffix = path.suffix.lower()
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; give the CAD file in it")
-    if not path.exists():
-        raise InputError(f"{path}: no such file (looked in {path.parent.absolute()})")
-    if suffix not in SUFFIXES:
+    if suffix not in READERS and path.is_file():
         raise InputError(
             f"{path}: cannot read {suffix or 'a file without suffix'}; use one of "
-            + ", ".join(SUFFIXES)
+            + ", ".join(READERS)
         )
+    read_head(path, max_bytes=MAX_BYTES, advice=_COARSER)
     try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise InputError(
-                f"{path}: {size / 2**30:.1f} GiB are more than {MAX_BYTES / 2**30:.0f} GiB; "
-                "export it with a coarser tolerance (0.01 mm is enough)"
-            )
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    if not data.strip():
-        raise InputError(f"{path}: is empty; export it again")
-    scale = MM_PER_UNIT[units]
-    if suffix == ".stl":
-        vertices, notes = _read_stl(data, path)
-        vertices *= scale
-        return vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), notes
-    if suffix in (".step", ".stp"):
-        data, suffix, scale = _glb_of_step(data, path, units), ".glb", 1000.0  # always metres
-    vertices, faces = _read_scene(data, path, suffix)
-    return vertices * scale, faces, ()
+    return READERS[suffix](data, path, units)
 
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-def _read_stl(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+def _read_stl(data: bytes, path: Path, units: str) -> Mesh:
+    corners, notes = _stl_corners(data, path)
+    corners *= MM_PER_UNIT[units]
+    return corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3), notes
+
+
+def _stl_corners(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     """Corners [3F, 3] f64 in file units of a binary or ASCII STL file."""
     stated = int.from_bytes(data[80:84], "little") if len(data) >= 84 else 0
     held = max(len(data) - 84, 0)
@@ -109,8 +100,7 @@ def _read_ascii_stl(data: bytes, path: Path) -> np.ndarray:
         raise InputError(f"{path}: an STL file without triangles, or another text; export it again")
     if len(lines) > 3 * MAX_FACES:
         raise InputError(
-            f"{path}: {len(lines) // 3:,} triangles are more than {MAX_FACES:,}; export it with a "
-            "coarser tolerance (0.01 mm is enough)"
+            f"{path}: {len(lines) // 3:,} triangles are more than {MAX_FACES:,}; {_COARSER}"
         )
     facets = len(re.findall(rb"\bendfacet\b", data, re.IGNORECASE))
     if 3 * facets != len(lines) or not re.search(rb"\bendsolid\b", data[-2048:], re.IGNORECASE):
@@ -128,7 +118,17 @@ def _read_ascii_stl(data: bytes, path: Path) -> np.ndarray:
     return corners
 
 
-def _read_scene(data: bytes, path: Path, suffix: str) -> tuple[np.ndarray, np.ndarray]:
+def _read_scene(data: bytes, path: Path, units: str) -> Mesh:
+    vertices, faces = _scene_triangles(data, path, path.suffix.lower())
+    return vertices * MM_PER_UNIT[units], faces, ()
+
+
+def _read_step(data: bytes, path: Path, units: str) -> Mesh:
+    vertices, faces = _scene_triangles(_glb_of_step(data, path, units), path, ".glb")
+    return vertices * 1000.0, faces, ()  # OpenCASCADE writes metres
+
+
+def _scene_triangles(data: bytes, path: Path, suffix: str) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] and faces [F, 3] of every mesh in the file, each where its node puts it."""
     promised = {".ply": _ply_counts, ".glb": _gltf_counts, ".gltf": _gltf_counts}
     counts = promised[suffix](data, path) if suffix in promised else {}
@@ -163,8 +163,7 @@ def _read_scene(data: bytes, path: Path, suffix: str) -> tuple[np.ndarray, np.nd
     faces = sum(len(mesh.faces) for _, mesh in meshes)
     if faces > MAX_FACES:
         raise InputError(
-            f"{path}: {faces:,} faces are more than the {MAX_FACES:,} that fit in memory; export "
-            "it with a coarser tolerance (0.01 mm is enough)"
+            f"{path}: {faces:,} faces are more than {MAX_FACES:,}, which fit in memory; {_COARSER}"
         )
     if suffix == ".ply" and len(meshes[0][1].faces) < counts.get("face", 0):
         raise InputError(
@@ -237,3 +236,14 @@ def _step_unit(data: bytes) -> str | None:
             name = (si.group(1) or "") if si else based.group(1) if based else "?"
             found.add(names.get(name))
     return found.pop() if len(found) == 1 else None
+
+
+READERS: dict[str, Callable[[bytes, Path, str], Mesh]] = {
+    ".stl": _read_stl,
+    **dict.fromkeys((".obj", ".ply", ".glb", ".gltf"), _read_scene),
+    **dict.fromkeys((".step", ".stp"), _read_step),
+}
+"""By suffix, what reads the bytes of a file, its path and unit into a mesh: a new format goes here.
+
+Raises InputError for a file that is damaged, truncated or too large.
+"""

@@ -18,10 +18,10 @@ from vanejax.cad.part import part_from_mesh
 from vanejax.cad.solid_bodies import connected
 from vanejax.cad.triangles import Triangles, in_use, weld
 from vanejax.errors import InputError
-from vanejax.files import array_header
+from vanejax.files import array_header, read_head
 from vanejax.scans import point_file
 from vanejax.scans.measured_scan import MIN_POINTS, MeasuredScan, at_place, measured, repeats
-from vanejax.scans.point_file import open_head, read_points
+from vanejax.scans.point_file import read_points
 from vanejax.scans.point_records import PointFile
 from vanejax.scans.scan_file import robust_extent
 from vanejax.scans.viewpoint import sampled_rows, why_not_from
@@ -120,7 +120,7 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
       InputError: the file is missing, empty, a folder, unreadable or damaged.
     """
     path = Path(path)
-    head = open_head(path)
+    head = read_head(path, max_bytes=point_file.MAX_BYTES, advice="thin it first")
     suffix = path.suffix.lower()
     if suffix == ".npz" and head.startswith(b"PK"):
         arrays = _array_names(path)
@@ -128,17 +128,17 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
             return _inspect_weights(path, arrays)
         if not {"points", "xyz"} & set(arrays):
             return _inspect_arrays(path, arrays)
-    if suffix in point_file.SUFFIXES:
+    if suffix in point_file.READERS:
         file = read_points(path)
         if file.num_faces:
             return _inspect_mesh(path, file.format)
         return _inspect_cloud(path, file)
-    if suffix in cad_file.SUFFIXES:
+    if suffix in cad_file.READERS:
         return _inspect_mesh(path, suffix[1:].upper())
     if suffix == ".json":
         return _inspect_json(path)
     kind = "text" if b"\0" not in head and head.isascii() else "binary"
-    known = ", ".join(dict.fromkeys((*point_file.SUFFIXES, *cad_file.SUFFIXES, ".json")))
+    known = ", ".join(dict.fromkeys((*point_file.READERS, *cad_file.READERS, ".json")))
     note = f"not a file that vanejax reads: {known}"
     return Inspection(str(path), "unknown", kind, path.stat().st_size, notes=(note,))
 

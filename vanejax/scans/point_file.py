@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
 from vanejax.errors import InputError
-from vanejax.files import array_header
+from vanejax.files import array_header, read_head
 from vanejax.scans.pcd_file import read_pcd
 from vanejax.scans.ply_file import read_ply
 from vanejax.scans.point_records import (
@@ -23,7 +24,6 @@ from vanejax.scans.point_records import (
 )
 
 TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".asc", ".pts")
-SUFFIXES = (".ply", ".pcd", *TEXT_SUFFIXES, ".npz", ".npy")
 MAX_BYTES = 2**34
 
 _MAGIC = {b"ply": ".ply", b"# .PCD": ".pcd", b"PK\x03\x04": ".npz", b"\x93NUMPY": ".npy"}
@@ -37,15 +37,15 @@ def read_points(path: Path) -> PointFile:
       InputError: the file is missing, empty, a folder, truncated, or of another kind.
     """
     suffix = path.suffix.lower()
-    head = open_head(path)
+    head = read_head(path, max_bytes=MAX_BYTES, advice="thin the scan first")
     if suffix in _MESH_SUFFIXES:
         raise InputError(
             f"{path}: is a CAD file, not a scan; the scan comes first, the CAD file second"
         )
-    if suffix not in SUFFIXES:
+    if suffix not in READERS:
         raise InputError(
             f"{path}: cannot read {suffix or 'a file without suffix'} as a scan; use one of "
-            + ", ".join(SUFFIXES)
+            + ", ".join(READERS)
         )
     for magic, right in _MAGIC.items():
         if head.startswith(magic) and suffix != right:
@@ -53,46 +53,15 @@ def read_points(path: Path) -> PointFile:
                 f"{path}: is named {suffix} but holds {right[1:].upper()}: rename it to {right}"
             )
     try:
-        if suffix == ".ply":
-            return read_ply(path)
-        if suffix == ".pcd":
-            return read_pcd(path)
-        if suffix in TEXT_SUFFIXES:
-            return _read_text(path, head)
-        return _read_numpy(path)
+        return READERS[suffix](path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def open_head(path: Path) -> bytes:
-    """The first 64 KiB of a file.
-
-    Raises:
-      InputError: the file is missing, a folder, empty, unreadable, or larger than any scan.
-    """
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; give the file in it")
-    if not path.exists():
-        raise InputError(f"{path}: no such file (looked in {path.parent.absolute()})")
-    if not path.is_file():
-        raise InputError(f"{path}: is a device or a pipe; give a file")
-    try:
-        size = path.stat().st_size
-        with path.open("rb") as file:
-            head = file.read(1 << 16)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if size > MAX_BYTES:
-        raise InputError(
-            f"{path}: {size / 2**30:.0f} GiB are more than {MAX_BYTES / 2**30:.0f} GiB; thin it"
-        )
-    if size <= 1 << 16 and not head.strip():
-        raise InputError(f"{path}: is empty; export it again")
-    return head
-
-
-def _read_text(path: Path, head: bytes) -> PointFile:
+def _read_text(path: Path) -> PointFile:
     """Tables: a header line or comments may stand before them, and in PTS the number of points."""
+    with path.open("rb") as file:
+        head = file.read(1 << 16)
     if b"\0" in head:
         raise InputError(f"{path}: is no text, or UTF-16: save it as UTF-8 text; or rename it")
     bom = head.startswith(b"\xef\xbb\xbf")
@@ -278,3 +247,15 @@ def _rows(
     if not array.size:
         raise InputError(f"{path}: holds no points; export the scan again")
     return split_columns(array.reshape(-1, array.shape[-1]))
+
+
+READERS: dict[str, Callable[[Path], PointFile]] = {
+    ".ply": read_ply,
+    ".pcd": read_pcd,
+    **dict.fromkeys(TEXT_SUFFIXES, _read_text),
+    **dict.fromkeys((".npz", ".npy"), _read_numpy),
+}
+"""By suffix, what reads a file of points: a new format goes here.
+
+Raises InputError for a file that is damaged, truncated or too large, OSError if it cannot be read.
+"""
