@@ -10,6 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vanejax.errors import InputError
+
+MATRIX_TOLERANCE = 1e-3  # of a rotation's entries: a matrix typed by hand has three decimals
+
 Array = Any  # of numpy, float64 on the host, or of JAX, which is not imported here
 
 
@@ -70,6 +74,48 @@ class RigidTransform(NamedTuple):
             rotation=_matmul(self.rotation, other.rotation),
             translation=turned + self.translation,
         )
+
+
+def rigid_from_matrix(matrix: np.ndarray, *, where: str) -> RigidTransform:
+    """The rigid motion that a 4x4 matrix is meant to be.
+
+    Args:
+      matrix: [4, 4] f64; translation in mm.
+      where: what the message of an error starts with.
+
+    Returns:
+      Its translation, and the rotation nearest to its own: at most `MATRIX_TOLERANCE` away.
+
+    Raises:
+      InputError: not finite, or not a rigid motion; says what it is instead.
+    """
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{where}: the matrix holds a value that is not finite")
+    rotation = matrix[:3, :3]
+    if not np.allclose(matrix[3], [0, 0, 0, 1], rtol=0, atol=1e-9):
+        transposed = np.allclose(matrix[:, 3], [0, 0, 0, 1], rtol=0, atol=1e-9)
+        hint = "; it looks column-major: transpose it" if transposed else ""
+        raise InputError(f"{where}: the last row is {matrix[3].tolist()}, not 0, 0, 0, 1{hint}")
+    # before any product: entries of 1e200 would overflow it
+    if (largest := np.abs(rotation).max()) > 1e6:
+        raise InputError(f"{where}: no rotation: it has an entry of size {largest:.3g}, at most 1")
+    gram = rotation.T @ rotation
+    error = np.abs(gram - np.eye(3)).max()
+    if error > MATRIX_TOLERANCE:
+        scale = np.sqrt(np.trace(gram) / 3)
+        even = scale > 0 and np.abs(gram / scale**2 - np.eye(3)).max() <= MATRIX_TOLERANCE
+        hint = f"it scales by {scale:.4g}" if even else "its axes are not unit and square"
+        raise InputError(
+            f"{where}: no rotation: {hint} (R^T R differs from 1 by {error:.2g}, "
+            f"more than {MATRIX_TOLERANCE:g})"
+        )
+    if np.linalg.det(rotation) < 0:
+        raise InputError(
+            f"{where}: no rotation but a mirror image (determinant -1); "
+            "one axis has the wrong sign, or the frame is left-handed"
+        )
+    u, _, vt = np.linalg.svd(rotation)
+    return RigidTransform(rotation=u @ vt, translation=matrix[:3, 3].copy())
 
 
 def _matmul(a: Array, b: Array) -> Array:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
 from vanejax.machine.pose_file import (
-    euler_xyz_deg,
+    euler_deg,
     pose_to_dict,
     quaternion_wxyz,
     read_pose,
@@ -24,7 +24,7 @@ from vanejax.machine.pose_file import (
     write_result,
 )
 from vanejax.matching import se3 as rigid
-from vanejax.rigid import RigidTransform
+from vanejax.rigid import RigidTransform, rigid_from_matrix
 
 NAMES = {"scan_name": "scan", "part_name": "vane", "part_sha256": "ab" * 32}
 ANGLE = st.floats(-180, 180)
@@ -80,11 +80,11 @@ def test_the_host_form_is_that_of_rigid() -> None:
         theirs = np.asarray(rigid.euler_xyz_deg(rotation.astype(np.float32)))
         # f32 eps times 180 deg, and an arc sine near 90 deg
         np.testing.assert_allclose(
-            Rotation.from_euler("xyz", euler_xyz_deg(rotation), degrees=True).as_matrix(),
+            Rotation.from_euler("xyz", euler_deg(rotation, "xyz"), degrees=True).as_matrix(),
             Rotation.from_euler("xyz", theirs, degrees=True).as_matrix(),
             atol=1e-3,
         )
-    assert euler_xyz_deg(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])).tolist() == [0, 90, 0]
+    assert euler_deg(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), "xyz").tolist() == [0, 90, 0]
 
 
 def test_a_half_turn_has_a_quaternion_without_loss() -> None:
@@ -167,8 +167,6 @@ def test_every_way_to_write_a_guess(tmp_path: Path) -> None:
 def test_a_rounded_matrix_becomes_the_nearest_rotation(
     noise: list[float], a: float, c: float
 ) -> None:
-    from vanejax.machine.pose_file import rigid_from_matrix
-
     truth = pose((a, 25.0, c), (0.0, 0.0, 100.0))
     rough = truth.as_matrix()
     rough[:3, :3] += np.reshape(noise, (3, 3))

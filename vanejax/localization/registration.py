@@ -28,7 +28,7 @@ from vanejax.localization.pose_result import PoseResult, Refinement
 from vanejax.localization.pose_search import Candidates, converge, initial_poses, search
 from vanejax.localization.residuals import MeasurementModel, RayCasting, measurement_model
 from vanejax.localization.verdict import Limits
-from vanejax.rigid import RigidTransform
+from vanejax.rigid import RigidTransform, rigid_from_matrix
 from vanejax.scanner.sensor import Sensor, preset
 from vanejax.scans.measured_scan import MeasuredScan, clean_scan
 from vanejax.scans.scan_file import load_scan
@@ -310,12 +310,9 @@ def _check_guess(init: RigidTransform) -> RigidTransform:
     translation = np.asarray(init.translation, np.float64)
     if rotation.shape != (3, 3) or translation.shape != (3,):
         raise InputError(f"init must be one pose, got rotations of shape {rotation.shape}")
-    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-    if not (orthonormal and np.linalg.det(rotation) > 0 and np.isfinite(translation).all()):
-        raise InputError(
-            "init is no rigid motion: its rotation is not orthonormal and right-handed"
-        )
-    return RigidTransform(rotation, translation)
+    pose = RigidTransform(rotation, translation)
+    rigid_from_matrix(pose.as_matrix(), where="init")
+    return pose
 
 
 @contextmanager

@@ -13,10 +13,11 @@ import os
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
 from vanejax.machine.frame_notation import NOTATIONS, notation_of
-from vanejax.machine.pose_file import parse_transform, quaternion_wxyz, read_text
+from vanejax.machine.pose_file import parse_transform, read_text
 from vanejax.rigid import RigidTransform
 
 
@@ -50,14 +51,11 @@ class Compensation:
 
 
 def axis_angle_deg(rotation: np.ndarray) -> tuple[np.ndarray, float]:
-    """Unit axis [3] and angle in degrees, 0 to 180, of a rotation [3, 3]; z where it turns nothing.
-
-    From its quaternion (w, v): angle 2 atan2(|v|, w), so that small angles keep their digits.
-    """
-    w, *v = quaternion_wxyz(rotation)
-    length = float(np.linalg.norm(v))
-    axis = np.array(v) / length if length > 0 else np.array([0.0, 0.0, 1.0])
-    return axis, float(np.degrees(2 * np.arctan2(length, w)))
+    """Unit axis [3] and angle in degrees, 0 to 180, of a rotation [3, 3]; z for no rotation."""
+    vector = Rotation.from_matrix(rotation).as_rotvec()
+    angle = float(np.linalg.norm(vector))
+    axis = vector / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
+    return axis, float(np.degrees(angle))
 
 
 def rounding_error_mm(written: RigidTransform, meant: RigidTransform, radius_mm: float) -> float:

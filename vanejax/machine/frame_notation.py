@@ -13,9 +13,10 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
-from vanejax.machine.pose_file import euler_xyz_deg, kuka_frame, parse_transform
+from vanejax.machine.pose_file import euler_deg, kuka_frame, parse_transform
 from vanejax.rigid import RigidTransform
 
 DECIMALS_MM = 4
@@ -91,7 +92,7 @@ def read_kuka(text: str) -> RigidTransform:
         name, *value = item.split() or [""]
         words.append((name.upper(), " ".join(value)))
     values = _all_of(words, "XYZABC", "the KUKA frame")
-    rotation = _turn("Z", values["A"]) @ _turn("Y", values["B"]) @ _turn("X", values["C"])
+    rotation = _rotation("ZYX", values["A"], values["B"], values["C"])
     return RigidTransform(rotation, _xyz(values))
 
 
@@ -113,7 +114,7 @@ def write_iso(machine_from_part: RigidTransform, *, work_offset: int = 1) -> str
     if work_offset not in WORK_OFFSETS:
         raise InputError(f"work offset {work_offset}: should be 1 to 6, for G54 to G59")
     x, y, z = (_fixed(v, DECIMALS_MM) for v in machine_from_part.translation)
-    i, j, k = (_fixed(v, DECIMALS_DEG) for v in _euler_zxz_deg(machine_from_part.rotation))
+    i, j, k = (_fixed(v, DECIMALS_DEG) for v in euler_deg(machine_from_part.rotation, "ZXZ"))
     return (
         f"G90 G10 L2 P{work_offset} X{x} Y{y} Z{z}\n"
         f"G{53 + work_offset}\n"
@@ -167,7 +168,7 @@ def read_iso(text: str) -> RigidTransform:
             if tilted is not None:
                 raise InputError(f"the ISO block {line.strip()!r} is a second G68.2")
             values = _some_of(others, "XYZIJK", "G68.2 (with Euler angles, without P)")
-            rotation = _turn("Z", values["I"]) @ _turn("X", values["J"]) @ _turn("Z", values["K"])
+            rotation = _rotation("ZXZ", values["I"], values["J"], values["K"])
             tilted = RigidTransform(rotation, _xyz(values))
     if offset is None:
         raise InputError("there is no work offset; give G10 L2 P1 X Y Z (or G54 X Y Z) in mm")
@@ -188,7 +189,7 @@ def write_heidenhain(machine_from_part: RigidTransform) -> str:
     """
     x, y, z = (_fixed(v, DECIMALS_MM, sign=True) for v in machine_from_part.translation)
     a, b, c = (
-        _fixed(v, DECIMALS_DEG, sign=True) for v in euler_xyz_deg(machine_from_part.rotation)
+        _fixed(v, DECIMALS_DEG, sign=True) for v in euler_deg(machine_from_part.rotation, "xyz")
     )
     return (
         "CYCL DEF 7.0 DATUM SHIFT\n"
@@ -214,7 +215,7 @@ def read_heidenhain(text: str) -> RigidTransform:
         angles = _all_of(
             re.findall(rf"SP([A-Z])\s*({_NUMBER})(?![\d.])", planes[0]), "ABC", "PLANE SPATIAL, SP"
         )
-        rotation = _turn("Z", angles["C"]) @ _turn("Y", angles["B"]) @ _turn("X", angles["A"])
+        rotation = _rotation("ZYX", angles["C"], angles["B"], angles["A"])
     return RigidTransform(rotation, _xyz(values))
 
 
@@ -257,7 +258,7 @@ def read_siemens(text: str) -> RigidTransform:
     rotation = np.eye(3)
     if len(values) == 2:
         angles = values[1]
-        rotation = _turn("Z", angles["Z"]) @ _turn("Y", angles["Y"]) @ _turn("X", angles["X"])
+        rotation = _rotation("ZYX", angles["Z"], angles["Y"], angles["X"])
     return RigidTransform(rotation, _xyz(values[0]))
 
 
@@ -307,30 +308,10 @@ def notation_of(text: str) -> str:
     return "matrix"
 
 
-def _euler_zxz_deg(rotation: np.ndarray) -> np.ndarray:
-    """Angles (i, j, k) with R = Rz(i) Rx(j) Rz(k), degrees; j is 0 to 180, at both ends k is 0."""
-    r = np.asarray(rotation, np.float64)
-    sine = np.hypot(r[0, 2], r[1, 2])
-    if sine < 10 * np.finfo(np.float64).eps:
-        # only i + k or i - k is defined
-        return np.degrees([np.arctan2(r[1, 0], r[0, 0]), np.arctan2(sine, r[2, 2]), 0.0])
-    i = np.arctan2(r[0, 2], -r[1, 2])
-    # of what is left when i is taken back: the three together are right to rounding
-    c, s = np.cos(i), np.sin(i)
-    k = np.arctan2(-(c * r[0, 1] + s * r[1, 1]), c * r[0, 0] + s * r[1, 0])
-    return np.degrees([i, np.arctan2(sine, r[2, 2]), k])
-
-
-def _turn(axis: str, angle_deg: float) -> np.ndarray:
-    """Rotation [3, 3] by a right-handed angle about one axis."""
+def _rotation(order: str, *angles_deg: float) -> np.ndarray:
+    """Rotation [3, 3] of three angles, in an order as scipy names it."""
     # a whole number of turns less: degrees are exact, radians are not
-    angle = np.radians(np.remainder(angle_deg, 360.0))
-    c, s = np.cos(angle), np.sin(angle)
-    if axis == "X":
-        return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
-    if axis == "Y":
-        return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return Rotation.from_euler(order, np.remainder(angles_deg, 360.0), degrees=True).as_matrix()
 
 
 def _xyz(values: Mapping[str, float]) -> np.ndarray:

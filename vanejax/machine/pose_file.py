@@ -11,11 +11,13 @@ import importlib.metadata
 import json
 import os
 import re
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
 from vanejax.files import write_json
@@ -27,7 +29,7 @@ from vanejax.localization.pose_result import (
     Verdict,
     Verification,
 )
-from vanejax.rigid import RigidTransform
+from vanejax.rigid import MATRIX_TOLERANCE, RigidTransform, rigid_from_matrix
 
 FORMAT = "vanejax pose"
 VERSION = 1
@@ -52,7 +54,6 @@ _UNCERTAINTY = (
 )
 
 MAX_BYTES = 16 << 20
-MATRIX_TOLERANCE = 1e-3  # of a rotation's entries: three decimals are a matrix typed by hand
 
 
 def pose_to_dict(part_from_camera: RigidTransform) -> dict[str, Any]:
@@ -72,7 +73,7 @@ def pose_to_dict(part_from_camera: RigidTransform) -> dict[str, Any]:
         found[f"{name}_as"] = {
             "translation_mm": matrix[:3, 3].tolist(),
             "quaternion_wxyz": quaternion_wxyz(rotation).tolist(),
-            "euler_xyz_deg": euler_xyz_deg(rotation).tolist(),
+            "euler_xyz_deg": euler_deg(rotation, "xyz").tolist(),
             "kuka": kuka_frame(poses[name]),
         }
     return found
@@ -85,44 +86,24 @@ def kuka_frame(pose: RigidTransform) -> dict[str, float]:
     operating and programming instructions). B is within -90 to 90; at either end A is 0.
     """
     x, y, z = np.asarray(pose.translation, np.float64).tolist()
-    a, b, c = euler_xyz_deg(pose.rotation).tolist()
+    a, b, c = euler_deg(pose.rotation, "xyz").tolist()
     return {"X": x, "Y": y, "Z": z, "A": c, "B": b, "C": a}
 
 
 def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion [4] f64 (w, x, y, z) of a rotation [3, 3], with w >= 0.
+    """Unit quaternion [4] f64 (w, x, y, z) of a rotation [3, 3], with w >= 0."""
+    return Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
 
-    From the largest of four forms (Shepperd, 1978), so that no root of nearly nothing is taken.
+
+def euler_deg(rotation: np.ndarray, order: str) -> np.ndarray:
+    """Angles [3] of a rotation [3, 3], degrees, in an order as scipy names it.
+
+    Capitals are axes that turn along, small letters fixed ones. Where two axes fall together
+    (gimbal lock) the third angle is 0.
     """
-    r = np.asarray(rotation, np.float64)
-    d0, d1, d2 = np.diag(r)
-    s = [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
-    p = [r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]]
-    forms = np.array(
-        [
-            [1 + d0 + d1 + d2, s[0], s[1], s[2]],
-            [s[0], 1 + d0 - d1 - d2, p[0], p[1]],
-            [s[1], p[0], 1 - d0 + d1 - d2, p[2]],
-            [s[2], p[1], p[2], 1 - d0 - d1 + d2],
-        ]
-    )
-    best = forms[np.argmax(np.diag(forms))]
-    best = best / np.linalg.norm(best)
-    return -best if best[0] < 0 else best
-
-
-def euler_xyz_deg(rotation: np.ndarray) -> np.ndarray:
-    """`vanejax.matching.se3.euler_xyz_deg` for one rotation [3, 3], in float64 on the host."""
-    r = np.asarray(rotation, np.float64)
-    cosine = np.hypot(r[0, 0], r[1, 0])
-    # below rounding only a - c or a + c is defined: c is 0
-    c = 0.0 if cosine < 10 * np.finfo(np.float64).eps else np.arctan2(r[1, 0], r[0, 0])
-    # of what is left when c is taken back: near b = 90 deg the error of c is in a as well, and the
-    # three together are right to rounding
-    a = np.arctan2(
-        np.sin(c) * r[0, 2] - np.cos(c) * r[1, 2], np.cos(c) * r[1, 1] - np.sin(c) * r[0, 1]
-    )
-    return np.degrees([a, np.arctan2(-r[2, 0], cosine), c])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Gimbal lock")
+        return Rotation.from_matrix(rotation).as_euler(order, degrees=True)
 
 
 def result_to_dict(
@@ -285,48 +266,6 @@ def parse_transform(
             f"{where}: holds {len(words)} numbers; a pose is 16, the rows of a 4x4 matrix in mm"
         )
     return rigid_from_matrix(np.array(numbers).reshape(4, 4), where=where)
-
-
-def rigid_from_matrix(matrix: np.ndarray, *, where: str) -> RigidTransform:
-    """The rigid motion that a 4x4 matrix is meant to be.
-
-    Args:
-      matrix: [4, 4] f64; translation in mm.
-      where: what the message of an error starts with.
-
-    Returns:
-      Its translation, and the rotation nearest to its own: at most `MATRIX_TOLERANCE` away.
-
-    Raises:
-      InputError: not finite, or not a rigid motion; says what it is instead.
-    """
-    if not np.isfinite(matrix).all():
-        raise InputError(f"{where}: the matrix holds a value that is not finite")
-    rotation = matrix[:3, :3]
-    if not np.allclose(matrix[3], [0, 0, 0, 1], rtol=0, atol=1e-9):
-        transposed = np.allclose(matrix[:, 3], [0, 0, 0, 1], rtol=0, atol=1e-9)
-        hint = "; it looks column-major: transpose it" if transposed else ""
-        raise InputError(f"{where}: the last row is {matrix[3].tolist()}, not 0, 0, 0, 1{hint}")
-    # before any product: entries of 1e200 would overflow it
-    if (largest := np.abs(rotation).max()) > 1e6:
-        raise InputError(f"{where}: no rotation: it has an entry of size {largest:.3g}, at most 1")
-    gram = rotation.T @ rotation
-    error = np.abs(gram - np.eye(3)).max()
-    if error > MATRIX_TOLERANCE:
-        scale = np.sqrt(np.trace(gram) / 3)
-        even = scale > 0 and np.abs(gram / scale**2 - np.eye(3)).max() <= MATRIX_TOLERANCE
-        hint = f"it scales by {scale:.4g}" if even else "its axes are not unit and square"
-        raise InputError(
-            f"{where}: no rotation: {hint} (R^T R differs from 1 by {error:.2g}, "
-            f"more than {MATRIX_TOLERANCE:g})"
-        )
-    if np.linalg.det(rotation) < 0:
-        raise InputError(
-            f"{where}: no rotation but a mirror image (determinant -1); "
-            "one axis has the wrong sign, or the frame is left-handed"
-        )
-    u, _, vt = np.linalg.svd(rotation)
-    return RigidTransform(rotation=u @ vt, translation=matrix[:3, 3].copy())
 
 
 def read_text(path: Path) -> str:

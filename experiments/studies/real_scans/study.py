@@ -30,8 +30,7 @@ from vanejax.cad.part import Part, load_part
 from vanejax.errors import InputError
 from vanejax.files import read_json
 from vanejax.localization.registration import register
-from vanejax.machine.pose_file import rigid_from_matrix
-from vanejax.rigid import RigidTransform
+from vanejax.rigid import RigidTransform, rigid_from_matrix
 
 TRUTH = "ground_truth.json"
 RIGHT_DEG, RIGHT_MM, MOST_SECONDS = 5.0, 5.0, 5.0
