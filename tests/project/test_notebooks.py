@@ -1,203 +1,133 @@
-"""The notebooks run from top to bottom: their code alone, and in a kernel as Jupyter runs them."""
+"""The notebooks hold the outputs of their code, and running them gives the same outputs."""
 
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
-import jax
+import nbformat
 import numpy as np
 import pytest
-from headless_browser import CHROMIUM, HeadlessBrowser
 
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scanner
-from vanejax.scans.scan_file import save_points
+from experiments import notebooks
+from vanejax import Camera, Scanner, guide_vane, hemisphere_viewpoints, save_points
+from vanejax.errors import InputError
 
-NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
-# figures and interactive views that a reader sees
-SHOWN = {"matching": (3, 1), "registration": (3, 1), "scanner": (2, 1)}
-CACHE = (
-    "jax_compilation_cache_dir",
-    "jax_persistent_cache_min_compile_time_secs",
-    "jax_persistent_cache_min_entry_size_bytes",
-)
-EACH = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+PATHS = sorted(notebooks.FOLDER.glob("*.ipynb"))
+EACH = pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
+PICTURES = {"matching": 4, "registration": 4, "scanner": 3}
+# what must hold in the kernel when all cells have run
+CHECKS = {
+    "scanner": "assert distance_mm.max() < 1e-3  # f32 points, 400 mm away",
+    "registration": """
+import json
+assert result.verdict.status == again.verdict.status == "accepted"
+assert rotation_error_deg < 0.01  # its sigma is 0.001 deg
+assert chi_squared < 22.5  # 99.9 % of right poses
+written = json.loads(pose_file.read_text())["part_from_camera"]
+assert written == result.part_from_camera.as_matrix().tolist()
+assert "Accepted" in report_file.read_text()
+""",
+    "matching": """
+shares = [matching(m[-1], pair).right_share(10.0) for m in (untrained, trained)]
+assert shares[1] > 1.3 * shares[0]  # after 40 steps
+assert matching(shown[-1], shown_pair).right_share(10.0) > 0.8
+assert degrees < 2.0 and mm < 2.0  # 95 % of the test views are within 1.04 deg
+""",
+}
 
 
-def code_of(path: Path) -> list[str]:
-    """The code cells of a notebook, without what only Jupyter understands."""
-    cells = json.loads(path.read_text())["cells"]
-    return [
-        "".join(line for line in cell["source"] if not line.startswith("%"))
-        for cell in cells
-        if cell["cell_type"] == "code"
+def read(path: Path) -> nbformat.NotebookNode:
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    return notebook
+
+
+@EACH
+def test_the_stored_outputs_are_of_this_code(path: Path) -> None:
+    """If this is red: python -m experiments.notebooks"""
+    notebook = read(path)
+    assert notebook.metadata["outputs_of"] == notebooks.source_hash(notebook)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
+    outputs = [output for cell in code for output in cell.outputs]
+    assert all(cell.outputs for cell in code if "print(" in cell.source)
+    kinds = {output.output_type for output in outputs}
+    assert kinds <= {"stream", "execute_result", "display_data"}  # no error
+    assert {output.name for output in outputs if output.output_type == "stream"} == {"stdout"}
+    pictures = [
+        output.data["image/png"] for output in outputs if "image/png" in output.get("data", {})
     ]
-
-
-def run_cells(code: list[str], path: Path) -> dict[str, Any]:
-    """The names that code cells leave behind; what only shows itself is made and not shown."""
-    space: dict[str, Any] = {}
-    for cell in code:
-        exec(compile(cell, str(path), "exec"), space)
-    return space
+    assert len(pictures) == PICTURES[path.stem]
+    assert max(map(len, pictures)) * 3 / 4 <= notebooks.MAX_PICTURE_BYTES
+    assert path.stat().st_size < 400_000
+    assert "/tmp/" not in path.read_text()
 
 
 @EACH
-def test_outputs_are_not_committed(path: Path) -> None:
-    cells = json.loads(path.read_text())["cells"]
-    code = [cell for cell in cells if cell["cell_type"] == "code"]
-    assert code
-    assert all(not cell["outputs"] and cell["execution_count"] is None for cell in code)
-    assert len({cell["id"] for cell in cells}) == len(cells)
-
-
-def test_the_notebooks_are_these():
-    assert [path.stem for path in NOTEBOOKS] == sorted(SHOWN)
-
-
-@pytest.fixture(scope="module")
-def compiled(tmp_path_factory) -> Path:
-    """A folder for compiled programs: the kernel need not compile again what this process did."""
-    return tmp_path_factory.mktemp("compiled")
-
-
-@EACH
-def test_every_cell_runs(path: Path, capsys, compiled, tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    before = {name: getattr(jax.config, name) for name in CACHE}
-    try:
-        for name, value in zip(CACHE, (str(compiled), 0.0, -1), strict=True):
-            jax.config.update(name, value)
-        space = run_cells(code_of(path), path)
-    finally:
-        for name, value in before.items():
-            jax.config.update(name, value)
+@pytest.mark.slow
+def test_running_them_gives_the_stored_texts(path: Path, tmp_path) -> None:
+    stored, notebook = read(path), read(path)
+    notebook.cells.append(nbformat.v4.new_code_cell(CHECKS[path.stem]))
+    notebooks.execute(notebook, tmp_path)
     assert list(tmp_path.iterdir()) == []  # nothing is left where the reader stands
-    if path.stem == "scanner":
-        assert space["off"].max() < 1e-3  # f32 points, 400 mm away
-        assert "216 viewpoints, 54 of them for tests" in capsys.readouterr().out
-    if path.stem == "registration":
-        for result in (space["result"], space["again"]):
-            assert result.verdict.status == "accepted"
-        assert space["rotation_error_deg"] < 0.01  # its sigma is 0.001 deg
-        assert space["chi_squared"] < 22.5  # 99.9 % of right poses
-        saved = json.loads(space["pose_file"].read_text())
-        assert saved["part_from_camera"] == space["result"].part_from_camera.as_matrix().tolist()
-        assert "Accepted" in space["report_file"].read_text()
-    if path.stem == "matching":
-        before, after = (
-            space["matching"](space[name][-1], space["pair"]) for name in ("untrained", "trained")
-        )
-        assert after.right_share(10.0) > 1.3 * before.right_share(10.0)  # after 40 steps
-        # 95 % of the test views are within 1.04 deg
-        assert space["degrees"] < 2.0
-        assert space["mm"] < 2.0
-        found = space["matching"](space["shown"][-1], space["shown_pair"])
-        assert found.right_share(10.0) > 0.8
+    assert notebook.cells.pop().outputs == []
+    assert notebooks.texts(notebook) == notebooks.texts(stored)
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    # a box of warnings would be the first thing that a reader sees
+    assert not any(output.get("name") == "stderr" for output in outputs)
+    data = [output.data for output in outputs if "data" in output]
+    figures = sum("image/png" in entry for entry in data)
+    views = sum("<iframe" in entry.get("text/html", "") for entry in data)
+    assert (figures, views) == (PICTURES[path.stem] - 1, 1)
 
 
+@pytest.mark.slow
 def test_registration_takes_the_readers_own_files(tmp_path) -> None:
     """A scan in metres and a CAD file in inches, in place of the example."""
-    (path,) = (path for path in NOTEBOOKS if path.stem == "registration")
     part = guide_vane()
-    (tmp_path / "data").mkdir()
-    names = {"scan_file": tmp_path / "data" / "mine.csv", "part_file": tmp_path / "cad.stl"}
+    files = {"scan_file": tmp_path / "mine.csv", "part_file": tmp_path / "cad.stl"}
     view = hemisphere_viewpoints(part.center).view(100)
     scan = Scanner(part, surface_samples=1000).scan(Camera().scaled(0.3), view)
-    save_points(names["scan_file"], scan.points.astype(np.float64) / 1000)
+    save_points(files["scan_file"], scan.points.astype(np.float64) / 1000)
     mesh = part.mesh.copy()
     mesh.apply_scale(1 / 25.4)
-    mesh.export(names["part_file"])
-    code = code_of(path)
-    assert 'part_units = "mm"' in code[0]
-    code[0] = code[0].replace('part_units = "mm"', 'part_units = "in"')
-    for name, file in names.items():
-        assert f'{name} = ""' in code[0]
-        code[0] = code[0].replace(f'{name} = ""', f"{name} = {str(file)!r}")
-    space = run_cells(code, path)
+    mesh.export(files["part_file"])
+    notebook = read(notebooks.FOLDER / "registration.ipynb")
+    code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
+    for name, old, new in (
+        ("part_units", '"mm"', '"in"'),
+        *((name, '""', repr(str(file))) for name, file in files.items()),
+    ):
+        assert f"{name} = {old}" in code[0]
+        code[0] = code[0].replace(f"{name} = {old}", f"{name} = {new}")
+    space: dict = {}
+    for cell in code:
+        exec(compile(cell.replace("%matplotlib inline\n", ""), "registration.ipynb", "exec"), space)
     assert space["truth"] is None
     assert space["result"].verdict.status == "accepted"
-    off = view @ space["result"].part_from_camera
-    assert np.linalg.norm(off.apply(scan.points[:1]) - scan.points[:1]) < 0.05  # mm; no noise
-    written = sorted(file.name for file in (tmp_path / "data").iterdir())
-    assert written == ["mine.csv", "mine_pose.json", "mine_report.html"]
+    motion = view @ space["result"].part_from_camera
+    assert np.linalg.norm(motion.apply(scan.points[:1]) - scan.points[:1]) < 0.05  # mm; no noise
+    written = {file.name for file in tmp_path.iterdir()} - {file.name for file in files.values()}
+    assert written == {"mine_pose.json", "mine_report.html"}
 
 
-@pytest.fixture(scope="module")
-def executed(tmp_path_factory, compiled):
-    """Gives a notebook's cells after a kernel has run it, each notebook once."""
-    nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
-    pytest.importorskip("ipykernel", reason="ipykernel is not installed")
-    import nbformat
-
-    done: dict[Path, Any] = {}
-
-    def run(path: Path) -> Any:
-        if path not in done:
-            notebook = nbformat.read(path, as_version=4)
-            nbformat.validate(notebook)
-            folder = tmp_path_factory.mktemp(path.stem)
-            cache = zip(CACHE, (str(compiled), "0", "-1"), strict=True)
-            environment = os.environ | {name.upper(): value for name, value in cache}
-            client = nbclient.NotebookClient(
-                notebook, timeout=300, kernel_name="python3",
-                resources={"metadata": {"path": str(folder)}},
-            )  # fmt: skip
-            client.execute(env=environment)
-            done[path] = notebook.cells
-        return done[path]
-
-    return run
-
-
-def outputs(cells: Any) -> list[Any]:
-    return [output for cell in cells if cell.cell_type == "code" for output in cell.outputs]
-
-
-@EACH
-def test_a_kernel_shows_every_picture(path: Path, executed) -> None:
-    found = outputs(executed(path))
-    assert [o for o in found if o.output_type == "error"] == []
-    # a box of warnings would be the first thing that a reader sees
-    assert "".join(o.text for o in found if o.get("name") == "stderr") == ""
-    shown = [o.data for o in found if o.output_type in ("execute_result", "display_data")]
-    figures = sum("image/png" in data for data in shown)
-    views = sum("<iframe" in data.get("text/html", "") for data in shown)
-    assert (figures, views) == SHOWN[path.stem]
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium or google-chrome on the PATH")
-@EACH
-def test_a_browser_shows_it_without_a_network(path: Path, executed, tmp_path) -> None:
-    """All outputs one below the other, as an exported notebook has them."""
-    body = []
-    for output in outputs(executed(path)):
-        data = output.get("data", {})
-        if "text/html" in data:
-            body.append(data["text/html"])
-        elif "image/png" in data:
-            body.append(f'<p><img src="data:image/png;base64,{data["image/png"]}">')
-    page = tmp_path / "notebook.html"
-    page.write_text("<!doctype html><link rel=icon href='data:,'><body>" + "\n".join(body))
-    with HeadlessBrowser() as browser:
-        browser.open(page, height=5000)  # a frame out of sight is not drawn
-        pictures = "[...document.images].map(i => i.complete && i.naturalWidth > 300)"
-        assert browser.evaluate(pictures) == [True] * SHOWN[path.stem][0]
-        frame = "document.querySelector('iframe')"
-        box = browser.evaluate(
-            f"(({{x, y, width, height}}) => ({{x, y: y + scrollY, width, height}}))"
-            f"({frame}.getBoundingClientRect())"
-        )
-        for _ in range(100):  # the frame loads on its own
-            browser.settle()
-            pixels = np.round(255 * browser.screenshot(box)) @ (65536, 256, 1)
-            colors = len(np.unique(pixels))
-            if colors > 300:
-                break
-        assert colors > 300  # the shaded part; the page around it has some dozens
-        assert browser.requests() == [page.as_uri()]
-        assert browser.complaints() == []
+def test_the_command_runs_a_notebook_and_stores_its_outputs(tmp_path, monkeypatch, capsys) -> None:
+    plot = "%matplotlib inline\nimport matplotlib.pyplot as plt\nprint('3.5 mm')\nplt.plot([1, 2]);"
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(plot)])
+    nbformat.write(notebook, tmp_path / "own.ipynb")
+    monkeypatch.setattr(notebooks, "FOLDER", tmp_path)
+    monkeypatch.setattr(notebooks, "ROOT", tmp_path)
+    notebooks.main(SimpleNamespace(names=["own"]))
+    assert capsys.readouterr().out.startswith("own.ipynb: ")
+    (cell,) = read(tmp_path / "own.ipynb").cells
+    assert cell.execution_count == 1
+    assert cell.outputs[0].text == "3.5 mm\n"
+    assert "image/png" in cell.outputs[1].data
+    changed = json.loads((tmp_path / "own.ipynb").read_text())
+    assert changed["metadata"]["outputs_of"] == notebooks.source_hash(notebook)
+    notebook.cells[0].source += "  # changed"
+    assert changed["metadata"]["outputs_of"] != notebooks.source_hash(notebook)
+    with pytest.raises(InputError, match="no notebook theirs"):
+        notebooks.main(SimpleNamespace(names=["theirs"]))
