@@ -224,7 +224,7 @@ def test_every_program_of_the_pages_is_run_by_reproduce_or_by_a_test() -> None:
                 named.add(words[2])
     run_by_tests = {
         f"experiments.{name}": next((ROOT / "tests").rglob(f"test_{name}.py"))
-        for name in ("docs_pictures", "evaluate", "reproduce", "results_page")
+        for name in ("docs_pictures", "evaluate", "notebooks", "reproduce", "results_page")
     }
     assert all(path.exists() for path in run_by_tests.values())
     studied = {study.arguments[0] for study in STUDIES}
