@@ -1,15 +1,15 @@
-"""Every table and figure of the paper again, with ours beside it, in one HTML page.
+"""The reproduction of the paper: every table and figure with our values, in one HTML page.
 
 python -m experiments.reproduce --quick [--weights FILE] [--out runs/reproduce]
 python -m experiments.reproduce [--real-scans FOLDER] [--shapes PATH] [--only NAME,...] [--plan]
 python -m experiments.reproduce --docs
 
-``--quick`` shows the recorded results of experiments/results and evaluates the pretrained weights
-afresh on the 54 test views: minutes. Without it everything is trained and measured again, each
-study in a folder of its own under ``--out``: many hours, ``--plan`` says how many. Give the same
-command again to go on: what ended is not done again. A study that fails is named in the page, the
-others go on, and the exit code is 1. ``--docs`` writes docs/results.md from the recorded results.
-Results: reproduction.html in ``--out``, which needs no network and no other file.
+``--quick`` shows the recorded results of experiments/results, evaluates the pretrained weights on
+the 54 test views and runs the virtual stand again: minutes. Without it everything is trained and
+measured again, each study in its own folder under ``--out``: many hours, ``--plan`` says how many.
+Give the same command again to go on: finished studies are kept. A study that fails is named in the
+page, the others go on, and the exit code is 1. ``--docs`` writes docs/results.md from the recorded
+results. Results: reproduction.html in ``--out``, which needs no network and no other file.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.pages.reproduction.document import Document, document, to_markdown
-from experiments.pages.reproduction.live import Live, evaluate_live, measure_position
+from experiments.pages.reproduction.live import evaluate_live, measure_position
 from experiments.pages.reproduction.page import to_page
 from experiments.pages.reproduction.run import estimate, measured, outcomes_json, run_studies
 from experiments.pages.reproduction.studies import ROOT, Outcome, chosen, recorded
@@ -34,39 +34,14 @@ DOCS = ROOT / "docs"
 PAGE = DOCS / "results.md"
 FILE = "reproduction.html"
 SOLIDS = "solids"  # what public.py itself trains on where there is no ModelNet40
-RECORDED = "Results are the recorded ones of experiments/results."
-
-
-@dataclasses.dataclass(frozen=True)
-class Reproduction:
-    """What a run of the command left.
-
-    Attributes:
-      page: the HTML file.
-      outcomes: of the studies; none where recorded results are shown.
-      live: what was evaluated for the page.
-    """
-
-    page: Path
-    outcomes: tuple[Outcome, ...] = ()
-    live: Live | None = None
-
-    @property
-    def failed(self) -> list[str]:
-        """Names of the studies that failed, or could not be run for that."""
-        return [
-            o.study.name
-            for o in self.outcomes
-            if o.state == "failed" or (o.state == "not run" and o.study.needs)
-        ]
 
 
 def docs_page() -> str:
     """docs/results.md as the recorded results make it."""
     mode = (
         "Made by `python -m experiments.reproduce --docs` from the recorded results in "
-        "`experiments/results`; `--quick` makes a page of it, with more pictures and the "
-        "pretrained weights evaluated afresh."
+        "`experiments/results`; `--quick` makes an HTML page of it, with more pictures and the "
+        "pretrained weights evaluated again."
     )
     return to_markdown(document(recorded(), mode))
 
@@ -76,8 +51,8 @@ def write_docs() -> None:
     write_text(PAGE, docs_page())
 
 
-def quick(out: Path, weights: str) -> Reproduction:
-    """The page of the recorded results, with the weights evaluated afresh.
+def quick(out: Path, weights: str) -> None:
+    """Writes the page of the recorded results, with the weights evaluated again.
 
     Raises:
       InputError: weights that cannot be used, or a folder that cannot be written.
@@ -90,33 +65,28 @@ def quick(out: Path, weights: str) -> Reproduction:
     results = recorded()
     results.setdefault("position", live.position)
     mode = (
-        f"{RECORDED} For this page the weights were evaluated and the virtual stand was run again."
+        "Results are the recorded ones of experiments/results. For this page the weights were "
+        "evaluated and the virtual stand was run again."
     )
-    report = document(results, mode, live=live, docs=DOCS, run=out)
-    _write(page, report)
-    return Reproduction(page, live=live)
+    _write(page, document(results, mode, live=live, docs=DOCS, run=out))
 
 
-def full(out: Path, inputs: dict[str, str], only: str | None, plan: bool) -> Reproduction | None:
-    """Trains and measures everything again; None where only the plan was asked for.
+def full(out: Path, inputs: dict[str, str], only: str | None) -> list[Outcome]:
+    """Trains and measures everything again, and writes the page.
 
     Raises:
-      InputError: a study that is none, or a folder that cannot be written.
+      InputError: an unknown study, or a folder that cannot be written.
     """
-    studies = chosen(only)
-    print(estimate(studies, out, inputs), flush=True)
-    if plan:
-        return None
     page = _page(out)
-    outcomes = run_studies(studies, out, inputs, say=lambda text: print(text, flush=True))
+    outcomes = run_studies(chosen(only), out, inputs, say=lambda text: print(text, flush=True))
     write_text(out / "outcomes.json", outcomes_json(outcomes))
-    mode = "Everything that stands here was trained and measured for this page."
+    mode = "All results were trained and measured for this page."
     _write(page, document(measured(chosen(None), out), mode, outcomes=outcomes, run=out))
-    return Reproduction(page, tuple(outcomes))
+    return outcomes
 
 
 def _page(out: Path) -> Path:
-    """The page's path, once it is sure that it can be written."""
+    """The page's path, after a check that it can be written."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -148,11 +118,17 @@ def main(settings: argparse.Namespace) -> int:
     inputs: dict[str, Any] = {"shapes": settings.shapes or SOLIDS}
     if settings.real_scans:
         inputs["real_scans"] = settings.real_scans
-    done = full(settings.out, inputs, settings.only, settings.plan)
-    if done is None or not done.failed:
+    print(estimate(chosen(settings.only), settings.out, inputs), flush=True)
+    if settings.plan:
         return 0
-    print(f"not everything could be measured: {', '.join(done.failed)}")
-    return 1
+    outcomes = full(settings.out, inputs, settings.only)
+    # a study without an input of the user is no failure; one whose needed study failed is
+    failed = [
+        o.study.name for o in outcomes if not o.ended and (o.state == "failed" or o.study.needs)
+    ]
+    if failed:
+        print(f"not everything could be measured: {', '.join(failed)}")
+    return 1 if failed else 0
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -52,7 +52,7 @@ def tuning_table(report: Report) -> str:
 
 
 def benchmark_table(report: Report) -> str:
-    """Every time of the benchmark, with the machine and the date above."""
+    """Every time of the benchmark, with what it is compared with."""
     rows = []
     for row in report["rows"]:
         if not row["seconds"]:
@@ -62,30 +62,20 @@ def benchmark_table(report: Report) -> str:
         goal = "" if row["goal_s"] is None else f"{row['goal_s']:g} s: {row['met']}"
         against = "; ".join(comparison(entry) for entry in row["against"])
         rows.append([row["name"], median, f"{least} to {most}", goal, against])
-    machine = report["machine"]
     repeats = min(row["repeats"] for row in report["rows"] if row["repeats"])
+    rate = report["machine"]["matmul_flops_per_second"] / 1e9
     return (
-        f"{machine['cpu']}, {machine['cores']} cores, "
-        f"{machine['matmul_flops_per_second'] / 1e9:.0f} GFLOP/s in a large f32 product; "
-        f"{report['date'][:10]}, commit {report['commit'][:10]}, medians of at least {repeats} "
-        f"repeats.\n\n"
+        f"Medians of at least {repeats} repeats; {rate:.0f} GFLOP/s in a large f32 product.\n\n"
         + table(["time of", "median (s)", "min to max", "goal", "compared with"], rows)
     )
 
 
-def performance_table(benchmark: Report, scaling: Report) -> str:
-    """The times of the benchmark, then how they grow with the sizes."""
-    return f"{benchmark_table(benchmark)}\n\n{scaling_table(scaling)}"
-
-
 def scaling_table(report: Report) -> str:
-    """How the times grow with the sizes, with the date above."""
+    """How the times grow with the sizes."""
     rows = []
     for row in report["scaling"]:
         sizes = ", ".join(f"{point['size']:,.0f}" for point in row["points"])
         medians = ", ".join(shown(point["seconds"]["median"]) for point in row["points"])
         power = "" if row["exponent"] is None else f"{row['exponent']:.2f}"
         rows.append([row["name"], f"{sizes} {row['unit']}", medians, power])
-    return f"Scaling: {report['date'][:10]}, commit {report['commit'][:10]}.\n\n" + table(
-        ["time of", "sizes", "median (s)", "exponent"], rows
-    )
+    return table(["time of", "sizes", "median (s)", "exponent"], rows)

@@ -58,10 +58,10 @@ def with_blocks(page: str, body_of: Callable[[str], str]) -> str:
     return _BLOCK.sub(made, page)
 
 
-def provenance(report: Mapping[str, Any]) -> str:
-    """Machine, date and commit of a record, in a line."""
+def provenance(name: str, report: Mapping[str, Any]) -> str:
+    """Name, machine, date and commit of a record, in a line."""
     commit = str(report["commit"] or "unknown")[:10]
-    return f"{machine_of(report)}; {report['date'][:10]}, commit {commit}."
+    return f"Record `{name}.json`: {machine_of(report)}; {report['date'][:10]}, commit {commit}."
 
 
 def machine_of(report: Mapping[str, Any]) -> str:

@@ -1,15 +1,14 @@
-"""A claim, and how it stands: judged from the figures alone.
+"""A claim and its verdict, computed from the records alone.
 
 The paper's numbers stand beside the claims and in the studies that compare with them
-(`methods.TABLE_1`, `position_report.PAPER`, the series of `robustness.json`). A sentence follows
-from the results by code, so that a new record changes it.
+(`methods.TABLE_1`, `position_report.PAPER`, the series of `robustness.json`).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import enum
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ VISIBLE = 1.1  # FFMDE over that at the true pose, from which on it tells of the
 
 
 class Verdict(enum.Enum):
-    """How a claim stands after our measurement."""
+    """The verdict on a claim after our measurement."""
 
     BETTER = "better"
     MET = "met"
@@ -32,7 +31,7 @@ class Verdict(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """What was found about a claim: our value, the verdict, and one sentence why."""
+    """Our value, the verdict, and one sentence why."""
 
     ours: str
     verdict: Verdict
@@ -41,20 +40,20 @@ class Finding:
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """A statement of the paper, or a goal of ours where the paper has none.
+    """A statement of the paper, or a goal of this project where the paper has none.
 
     Attributes:
       says: in words.
-      published: the paper's value, or the goal; from the results where it stands in them.
-      records: that it rests on; where one is missing it is not measured.
-      judge: the finding from all results.
-      place: in the paper, such as "Table 1"; empty for a goal of ours.
+      published: the paper's value, or the goal; a function of the records where they hold it.
+      judge: the finding from the records.
+      records: that it rests on, the arguments of both; a missing one leaves it not measured.
+      place: in the paper, such as "Table 1"; empty for a goal.
     """
 
     says: str
-    published: str | Callable[[Results], str]
-    records: tuple[str, ...]
-    judge: Callable[[Results], Finding]
+    published: str | Callable[..., str]
+    judge: Callable[..., Finding]
+    records: tuple[str, ...] = ()
     place: str = ""
 
     @property
@@ -66,21 +65,44 @@ class Claim:
         """The paper's value, or the goal, in words."""
         if isinstance(self.published, str):
             return self.published
-        return "–" if self.missing(results) else self.published(results)
+        return "–" if self.missing(results) else self.published(*self._reports(results))
 
     def finding(self, results: Results) -> Finding:
         """Judged, or not measured."""
         if missing := self.missing(results):
             return Finding("–", Verdict.UNKNOWN, f"There is no result {', '.join(missing)}.")
-        return self.judge(results)
+        return self.judge(*self._reports(results))
 
     def missing(self, results: Results) -> list[str]:
         """The records that it needs and that are not there."""
         return [name for name in self.records if name not in results]
 
+    def _reports(self, results: Results) -> list[Report]:
+        return [results[name] for name in self.records]
+
+
+@dataclasses.dataclass(frozen=True)
+class Topic:
+    """A section of the report: its heading, and its claims, all of the paper or all goals."""
+
+    title: str
+    claims: Sequence[Claim]
+
+    @property
+    def of_paper(self) -> bool:
+        """Whether the claims are the paper's."""
+        return all(claim.place for claim in self.claims)
+
+
+def claim(
+    says: str, published: str | Callable[..., str], *records: str, place: str = ""
+) -> Callable[[Callable[..., Finding]], Claim]:
+    """Makes a claim of the function below that judges it: its arguments are the records."""
+    return lambda judge: Claim(says, published, judge, records, place)
+
 
 def met_if(met: bool, *, partly: bool = False) -> Verdict:
-    """Met, or else partly so, or else not."""
+    """Met, or else partly met, or else not."""
     return Verdict.MET if met else Verdict.PARTLY if partly else Verdict.MISSED
 
 
@@ -95,32 +117,26 @@ def better_if(better: bool) -> Verdict:
 
 
 def over_floor(value: float, floor: float, paper: float, why: str) -> Finding:
-    """Whether a metric (mm) is better than the paper's, where it tells anything of the pose.
-
-    It does not where the true pose scores nearly as much.
+    """Whether a metric (mm) is better than the paper's, where the pose decides it.
 
     Args:
       value: measured.
-      floor: the metric at the true pose.
+      floor: the metric at the true pose; a value up to `VISIBLE` times it is not comparable.
       paper: its figure.
       why: what decides the metric where the pose does not.
     """
     side = "Below" if value < paper else "Above"
-    told = f"{side} the paper's, and the true pose itself scores {digits(floor, 3)} mm here: "
     ours = f"{digits(value, 3)} mm"
+    at_truth = f"{side} the paper's; the true pose itself has {digits(floor, 3)} mm here: "
     if value <= VISIBLE * floor:
-        return Finding(ours, Verdict.INCOMPARABLE, f"{told}{why} decide it, not the pose.")
-    return Finding(ours, better_if(value < paper), f"{told}the rest is the pose's.")
+        return Finding(ours, Verdict.INCOMPARABLE, f"{at_truth}{why} decide it, not the pose.")
+    return Finding(ours, better_if(value < paper), f"{at_truth}the pose makes the rest.")
 
 
 def digits(value: float | None, places: int = 2) -> str:
     """Significant digits, without an exponent."""
     if value is None or not np.isfinite(value):
         return "–"
-    return f"{float(f'{value:.{places}g}'):,.{_decimals(value, places)}f}"
-
-
-def _decimals(value: float, places: int) -> int:
-    if value == 0:
-        return 0
-    return max(0, places - 1 - int(np.floor(np.log10(abs(float(f"{value:.{places}g}"))))))
+    rounded = float(f"{value:.{places}g}")
+    decimals = 0 if rounded == 0 else places - 1 - int(np.floor(np.log10(abs(rounded))))
+    return f"{rounded:,.{max(0, decimals)}f}"

@@ -1,33 +1,111 @@
-"""What the report says, as one document, and that as Markdown for docs/results.md."""
+"""The report: one list of parts, from which docs/results.md and the HTML page are written.
+
+Its text is the template report.md; verdicts, tables and pictures are made from the records.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-from experiments.pages.reproduction.claim import Results
-from experiments.pages.reproduction.contents import OF_OURS, OF_PAPER, Section, sections, summary
-from experiments.pages.reproduction.live import Live
+import jinja2
+from matplotlib.figure import Figure
+
+from experiments.pages.blocks import BLOCKS, GROUPS, PAPER_SERIES, block, other_series, series
+from experiments.pages.reproduction.claim import Results, Topic, Verdict
+from experiments.pages.reproduction.claims.networks import (
+    ABLATIONS,
+    METHODS,
+    PUBLIC_SHAPES,
+    VIEWS,
+)
+from experiments.pages.reproduction.claims.poses import ANY_POSE, BOUND, POSITION, SPEED, VERDICT
+from experiments.pages.reproduction.claims.scans import (
+    CLUTTER,
+    DENSITY,
+    REAL_SCANS,
+    SCANNER,
+    SENSING,
+)
+from experiments.pages.reproduction.live import Live, against_evaluation, against_position
 from experiments.pages.reproduction.studies import BY_RECORD, Outcome
-from experiments.pages.reproduction.topic import Picture
-from experiments.runner.markdown import machine_of, table
+from experiments.runner.markdown import folded, machine_of, provenance, slug, table
+from experiments.studies.ablation import picture as ablation_picture
+from experiments.studies.comparison import pictures as comparison_pictures
+from experiments.studies.density import report as density_report
+from experiments.studies.fine import study as fine
+from experiments.studies.position import report as position_report
+from experiments.studies.robustness import report as robustness_report
+from experiments.studies.verdicts import report as verdict_report
 
-TITLE = "The paper, measured again"
+TITLE = "Reproduction of the paper"
 PAPER = (
     "“Simulation of Self-Occlusion Virtual Dataset Method for Robust Point Matching Algorithm, "
     "With Applications to Positioning of Guide Vanes”"
 )
-HOW_TO_READ = (
-    "The paper's figures are of its own vanes, camera and machine, which nobody else has; ours are "
-    "of the parametric guide vane built in here, under virtual sensors unless a section says real. "
-    "RMSE and FFMDE are not 0 at the true pose but what noise and the spacing of the points make "
-    "of them: where ours is no more than that, the row says not comparable, whichever is lower. "
-    "Every verdict and every sentence beside it is computed from the figures."
-)
-SUMMARIES = {"What the paper claims": OF_PAPER, "What the paper has not": OF_OURS}
-WAS_RUN = "What was run"
-SOURCES = "Where every number comes from"
+TOPICS = {
+    "scanner": SCANNER,
+    "density": DENSITY,
+    "methods": METHODS,
+    "views": VIEWS,
+    "public shapes": PUBLIC_SHAPES,
+    "ablations": ABLATIONS,
+    "sensing": SENSING,
+    "position": POSITION,
+    "bound": BOUND,
+    "verdict": VERDICT,
+    "any pose": ANY_POSE,
+    "real scans": REAL_SCANS,
+    "clutter": CLUTTER,
+    "speed": SPEED,
+}
+# by record: the picture that is drawn of it
+PICTURES: dict[str, Callable[[Any], Figure]] = {
+    "density": lambda report: density_report.picture(report["sweeps"]),
+    "comparison": comparison_pictures.error_shares,
+    "ablation_neighbors": ablation_picture.picture,
+    "ablation_noise": ablation_picture.picture,
+    "robustness": lambda report: robustness_report.picture(series(report, PAPER_SERIES)),
+    "position": position_report.picture,
+    "fine": lambda report: fine.picture(report["levels"]),
+    "verdicts": verdict_report.picture,
+}
+_BESIDE = 3  # series in one picture: more are too small on paper
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Picture:
+    """A figure of the report: drawn from a record, or made by a study.
+
+    Attributes:
+      alt: what it shows, for readers who cannot see it.
+      caption: what to look for.
+      docs: its name under docs, where the picture of the record is.
+      run: its path under a run's folder.
+      draw: makes it from the record; Markdown needs the file under docs all the same.
+    """
+
+    alt: str
+    caption: str
+    docs: str = ""
+    run: str = ""
+    draw: Callable[[], Figure] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Folded:
+    """Markdown that is closed until the reader opens it: raw tables."""
+
+    title: str
+    body: str
+
+
+Part = str | Picture | Folded
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,17 +113,13 @@ class Document:
     """What the report says.
 
     Attributes:
-      results: by record's name.
-      mode: how they came about, in a sentence.
-      sections: of the page.
-      outcomes: of a run's studies; none where recorded results are shown.
+      lead: the first paragraph, as text.
+      parts: Markdown, pictures and folded tables, in order.
       docs, run: folders of pictures, as far as there are any.
     """
 
-    results: Results
-    mode: str
-    sections: Sequence[Section]
-    outcomes: Sequence[Outcome] = ()
+    lead: str
+    parts: Sequence[Part]
     docs: Path | None = None
     run: Path | None = None
 
@@ -59,64 +133,146 @@ def document(
     docs: Path | None = None,
     run: Path | None = None,
 ) -> Document:
-    """The report of some results; see `Document`."""
-    return Document(results, mode, sections(results, live), outcomes, docs, run)
+    """The report of some records.
+
+    Args:
+      results: records by name.
+      mode: how they were made, in a sentence.
+      live: what was measured for the report.
+      outcomes: of the studies of a run; none where recorded results are shown.
+      docs, run: see `Document`.
+    """
+    kept: list[Picture | Folded] = []
+
+    def keep(part: Picture | Folded) -> str:
+        kept.append(part)
+        return f"\x00{len(kept) - 1}\x00"
+
+    def picture(alt: str, caption: str, *, draw: str = "", **files: str) -> str:
+        if not draw:
+            return keep(Picture(alt, caption, **files))
+        if draw not in results:
+            return ""
+        drawn = functools.partial(PICTURES[draw], results[draw])
+        return keep(Picture(alt, caption, **files, draw=drawn))
+
+    def series_pictures() -> str:
+        if "robustness" not in results:
+            return ""
+        names, made = other_series(results["robustness"]), []
+        # the short row comes first: castings stand beside castings
+        for end in range(len(names) % _BESIDE or _BESIDE, len(names) + 1, _BESIDE):
+            report = series(results["robustness"], names[max(0, end - _BESIDE) : end])
+            words = "; ".join(entry["title"].lower() for entry in report["series"])
+            draw = functools.partial(robustness_report.picture, report)
+            made.append(keep(Picture(f"Errors, FFMDE and RMSE over {words}",
+                                     f"Drawn as Fig. 11: {words}.", draw=draw)))  # fmt: skip
+        return "\n\n".join(made)
+
+    def shown_block(name: str) -> str:
+        records = [BLOCKS[part][0] for part in GROUPS.get(name, (name,))]
+        absent = [record for record in records if record not in results]
+        return missing(absent[0]) if absent else block(name, results)
+
+    def raw_table(title: str, name: str) -> str:
+        body = shown_block(name)
+        return body if body.startswith("**Not measured") else keep(Folded(title, body))
+
+    template = jinja2.Template(Path(__file__).with_name("report.md").read_text())
+    text = template.render(
+        results=results,
+        live=live,
+        outcomes=outcomes,
+        summary=functools.partial(summary, results),
+        section=lambda name: f"## {TOPICS[name].title}\n\n{judged(TOPICS[name], results)}",
+        picture=picture,
+        series_pictures=series_pictures,
+        block=shown_block,
+        table=raw_table,
+        provenance=lambda name: provenance(name, results[name]),
+        live_evaluation=lambda: against_evaluation(results.get("vane"), live),
+        live_position=lambda: against_position(results.get("position"), live),
+        studies=lambda: _outcomes(outcomes),
+        sources=lambda: keep(
+            Folded("Record, date, commit, machine, seed and command", _sources(results))
+        ),
+    )
+    parts: list[Part] = []
+    for place, piece in enumerate(text.split("\x00")):
+        if place % 2:
+            parts.append(kept[int(piece)])
+        elif piece.strip():
+            parts.append(re.sub(r"\n{3,}", "\n\n", piece.strip()))
+    lead = f"{PAPER}: every table and figure, with the paper's value, ours, and a verdict. {mode}"
+    return Document(lead, parts, docs, run)
 
 
 def to_markdown(report: Document) -> str:
     """docs/results.md: no date and no machine but those of the records."""
-    blocks = [
-        f"# {TITLE}",
-        f"{PAPER}: every table and figure, with the paper's value, ours, and what follows. "
-        f"{report.mode}",
-        HOW_TO_READ,
-        summaries(report),
-    ]
-    for section in report.sections:
-        blocks.append(f"## {section.topic.title}")
-        blocks += [_picture(part) if isinstance(part, Picture) else part for part in section.parts]
-    blocks.append(closing(report))
-    return "\n\n".join(block for block in blocks if block).rstrip() + "\n"
+    blocks = [f"# {TITLE}", report.lead]
+    for part in report.parts:
+        if isinstance(part, Folded):
+            blocks.append(folded(part.title, part.body))
+        elif isinstance(part, str):
+            blocks.append(part)
+        elif part.docs:
+            blocks.append(f"![{part.alt}]({part.docs})\n\n{part.caption}")
+    return "\n\n".join(blocks) + "\n"
 
 
-def summaries(report: Document) -> str:
-    """The claims of the paper and our own goals, as Markdown."""
-    return "\n\n".join(
-        f"## {title}\n\n{summary(topics, report.results)}" for title, topics in SUMMARIES.items()
+def missing(name: str) -> str:
+    """The sentence in place of a record."""
+    return (
+        f"**Not measured yet:** there is no result {name}. `{BY_RECORD[name].command()}` makes it."
     )
 
 
-def closing(report: Document) -> str:
-    """Provenance and, of a run, what became of its studies, as Markdown."""
-    parts = [f"## {WAS_RUN}", _outcomes(report.outcomes)] if report.outcomes else []
-    return "\n\n".join(
-        [
-            *parts,
-            f"## {SOURCES}",
-            "Tables and sentences are made from these records and from nothing else; "
-            "`python -m experiments.reproduce` runs all the commands, one after the other. A `+` "
-            "after a commit: the source tree had changes.",
-            _provenance(report.results),
-        ]
-    )
+def summary(results: Results, of_paper: bool) -> str:
+    """All claims of the paper, or all goals, with their verdicts and how many there are of each."""
+    rows, counts = [], Counter()
+    for topic in TOPICS.values():
+        if topic.of_paper is of_paper:
+            where = f"[{topic.title.partition(':')[0]}](#{slug(topic.title)})"
+            for row in _judged(topic, results):
+                rows.append([*row[:4], where])
+                counts[row[3]] += 1
+    kinds = [f"**{verdict.value}**" for verdict in Verdict]
+    counted = ", ".join(f"{counts[kind]} {kind.strip('*')}" for kind in kinds if counts[kind])
+    return f"{len(rows)} in all: {counted}.\n\n{table(_head(of_paper, 'section'), rows)}"
+
+
+def judged(topic: Topic, results: Results) -> str:
+    """A topic's claims with their verdicts and why."""
+    return table(_head(topic.of_paper, "because"), _judged(topic, results))
+
+
+def _judged(topic: Topic, results: Results) -> list[list[str]]:
+    rows = []
+    for claim in topic.claims:
+        finding = claim.finding(results)
+        verdict = f"**{finding.verdict.value}**"
+        rows.append([claim.words, claim.value(results), finding.ours, verdict, finding.because])
+    return rows
+
+
+def _head(of_paper: bool, last: str) -> list[str]:
+    words = ("claim of the paper", "paper") if of_paper else ("what", "goal")
+    return [*words, "ours", "verdict", last]
 
 
 def _outcomes(outcomes: Sequence[Outcome]) -> str:
-    """What became of the studies of a run."""
     rows = [
         [o.study.name, o.study.title, o.state if o.ended else f"**{o.state}**", o.why,
          f"{o.seconds / 60:.1f}"]
         for o in outcomes
     ]  # fmt: skip
-    return table(["study", "finds", "state", "why", "minutes"], rows)
+    return table(["study", "measures", "state", "why", "minutes"], rows)
 
 
-def _provenance(results: Results) -> str:
-    """Where every number comes from: record, date, commit, machine, seed, command."""
+def _sources(results: Results) -> str:
     rows = []
     for name, report in results.items():
-        config = report.get("config", {})
-        seed = report.get("seed", report.get("seeds", config.get("seed", "–")))
+        seed = report.get("seed", report.get("seeds", report.get("config", {}).get("seed", "–")))
         rows.append(
             [
                 f"`{name}.json`",
@@ -128,7 +284,3 @@ def _provenance(results: Results) -> str:
             ]
         )
     return table(["record", "date", "commit", "machine", "seed", "command"], rows)
-
-
-def _picture(picture: Picture) -> str:
-    return f"![{picture.alt}]({picture.docs})\n\n{picture.caption}" if picture.docs else ""

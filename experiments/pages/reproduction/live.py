@@ -10,10 +10,12 @@ from typing import Any
 
 from experiments.configs import vane
 from experiments.evaluate import evaluate
-from experiments.pages.reproduction.claim import digits
+from experiments.pages.reproduction.claim import Report, digits
+from experiments.pages.tables import MEASURES, evaluation_table
 from experiments.runner.experiment import Experiment
 from experiments.runner.markdown import table
 from experiments.studies.position import study as position
+from experiments.studies.position.report import magnitudes, moves_of, turns_of
 from experiments.train import load_or_scan
 from vanejax.errors import InputError
 from vanejax.training.weight_file import TrainedMatcher
@@ -86,29 +88,70 @@ def check_recipe(matcher: TrainedMatcher, config: Experiment) -> None:
     Raises:
       InputError: names what differs.
     """
-    network = config.make_network()
-    mine = {
-        "model": network.model,
-        "iterations": network.iterations,
-        "voxel_mm": config.data.voxel_mm,
-        "num_reference": config.data.num_reference,
+    network, data = config.make_network(), config.data
+    sampling = matcher.sampling
+    fields = {
+        "model": (matcher.model, network.model),
+        "iterations": (matcher.iterations, network.iterations),
+        "voxel_mm": (matcher.voxel_mm, data.voxel_mm),
+        "num_reference": (sampling.num_reference, data.num_reference),
     }
-    theirs = {
-        "model": matcher.model,
-        "iterations": matcher.iterations,
-        "voxel_mm": matcher.voxel_mm,
-        "num_reference": matcher.sampling.num_reference,
-    }
-    found = [
-        f"{name} is {theirs[name]}, not {value}"
-        for name, value in mine.items()
-        if theirs[name] != value
+    differences = [
+        f"{name} is {theirs}, not {ours}"
+        for name, (theirs, ours) in fields.items()
+        if theirs != ours
     ]
-    if found:
+    if differences:
         raise InputError(
-            f"the weights are of another recipe than {config.name}: {'; '.join(found)}; "
+            f"the weights are of another recipe than {config.name}: {'; '.join(differences)}; "
             "give weights exported from a run of it"
         )
+
+
+def position_errors(report: Report) -> dict[str, dict[str, float]]:
+    """Mean and largest error of all cameras' turns about the R axis and moves against the probe."""
+    errors = {
+        "turns": magnitudes(report, turns_of, "error_deg"),
+        "moves": magnitudes(report, moves_of, "against_probe_mm"),
+    }
+    return {name: {"mean": float(e.mean()), "max": float(e.max())} for name, e in errors.items()}
+
+
+def against_evaluation(record: Report | None, live: Live) -> str:
+    """The evaluation for this page, side by side with the record of experiments.train."""
+    made = (
+        f"The weights ({live.weights}) registered the {live.report['views']} test views again in "
+        f"{live.seconds:.0f} s, new scans included ({live.report['date'][:10]}, commit "
+        f"{str(live.report['commit'])[:10]})."
+    )
+    if record is None:
+        return f"{made}\n\n{evaluation_table(live.report)}"
+    pairs = {
+        f"{label}, {column}": tuple(r["summary"][name][column] for r in (record, live.report))
+        for name, label in MEASURES.items()
+        if name != "time_s"
+        for column in ("mean", "median", "max")
+    }
+    return (
+        f"{made}\n\n{side_by_side(pairs)} The record was made at commit "
+        f"{str(record['commit'])[:10]}; these weights were trained from commit "
+        f"{str(live.trained)[:10]}."
+    )
+
+
+def against_position(record: Report | None, live: Live | None) -> str:
+    """The stand that was run for this page, side by side with the record; nothing if it was not."""
+    if live is None or live.position is None or record is None:
+        return ""
+    if record is live.position:
+        return "There is no record of this study; it was run for this page."
+    old, new = map(position_errors, (record, live.position))
+    pairs = {
+        f"{words}, {column}": (old[name][column], new[name][column])
+        for name, words in (("turns", "rotation (deg)"), ("moves", "translation (mm)"))
+        for column in ("mean", "max")
+    }
+    return "The stand was run again for this page.\n\n" + side_by_side(pairs)
 
 
 def side_by_side(pairs: Mapping[str, tuple[float, float]]) -> str:
@@ -119,11 +162,11 @@ def side_by_side(pairs: Mapping[str, tuple[float, float]]) -> str:
         rows.append([words, digits(old, 3), digits(new, 3), f"{change:+.1%}"])
         if abs(change) > SAME:
             apart.append((abs(change), words))
-    told = f"All {len(rows)} figures are the recorded ones within {SAME:.0%}."
+    sentence = f"All {len(rows)} figures are the recorded ones within {SAME:.0%}."
     if apart:
         size, words = max(apart)
-        told = (
+        sentence = (
             f"{len(apart)} of {len(rows)} figures differ from the record by more than {SAME:.0%}, "
             f"most the {words} ({size:.0%})."
         )
-    return table(["", "recorded", "live", "difference"], rows) + "\n\n" + told
+    return table(["", "recorded", "live", "difference"], rows) + "\n\n" + sentence

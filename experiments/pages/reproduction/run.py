@@ -1,7 +1,7 @@
 """A run of the studies: one after the other, each in its own process and folder.
 
-What was finished before by the same command is not done again; what fails is told and does not
-stop the rest.
+A study that the same command finished before is not run again; one that fails is named and does
+not stop the rest.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ _EXCERPT = 300  # characters of a log's last line
 
 
 def measured(studies: Sequence[Study], out: Path) -> dict[str, Any]:
-    """The same of what studies left under ``out``."""
-    found = {}
-    for study in studies:
-        path = study.folder(out) / study.written
-        if study.record and finished(study, out) and path.is_file():
-            found[study.record] = read_json(path)
-    return found
+    """The records that the studies left under ``out``, by name."""
+    return {
+        study.record: read_json(study.folder(out) / study.written)
+        for study in studies
+        if study.record and finished(study, out)
+    }
 
 
 def estimate(studies: Sequence[Study], out: Path, inputs: Mapping[str, str]) -> str:
-    """What would be done and how long it takes, as aligned text."""
+    """The plan: what would be done and how long it takes, as aligned text."""
     lines, total = [], 0.0
     for study in studies:
         missing = [name for name in study.inputs if name not in inputs]
+        state = f"{study.hours:5.2f} h"
         if missing:
-            told = f"needs --{missing[0].replace('_', '-')}"
+            state = f"needs --{missing[0].replace('_', '-')}"
         elif finished(study, out):
-            told = "done before"
+            state = "done before"
         else:
-            told, total = f"{study.hours:5.2f} h", total + study.hours
-        lines.append(f"{study.name:<20}{told:<20}{study.title}".rstrip())
+            total += study.hours
+        lines.append(f"{study.name:<20}{state:<20}{study.title}".rstrip())
     return "\n".join([*lines, f"{'together, about':<20}{total:5.2f} h on two cores"])
 
 
@@ -62,13 +62,13 @@ def run_studies(
     *,
     say: Callable[[str], None] = print,
 ) -> list[Outcome]:
-    """Does the studies in order; every one has its outcome.
+    """Runs the studies in order; every one has its outcome.
 
     Args:
       studies: those needed by others first.
       out: folder; each study's own is inside, as are logs/NAME.txt and ended/NAME.json.
       inputs: of `INPUTS`, those that there are.
-      say: told what goes on.
+      say: receives the lines of progress.
 
     Raises:
       InputError: the folder cannot be written.
@@ -107,7 +107,9 @@ def _outcome(
     if done.returncode:
         return Outcome(study, "failed", f"exit code {done.returncode}: {_last(log)}", seconds)
     if not (study.folder(out) / study.written).is_file():
-        return Outcome(study, "failed", f"it ended well but wrote no {study.written}", seconds)
+        return Outcome(
+            study, "failed", f"ended without an error, but wrote no {study.written}", seconds
+        )
     stamp = {"arguments": study.arguments, "seconds": round(seconds, 1), "commit": git_commit()}
     write_json(_stamp(study, out), stamp)
     return Outcome(study, "done", seconds=seconds)
@@ -118,13 +120,13 @@ def _stamp(study: Study, out: Path) -> Path:
 
 
 def _last(log: Path) -> str:
-    """The last words of a log."""
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    return lines[-1][-_EXCERPT:] if lines else "it said nothing"
+    """The last line of a log."""
+    lines = log.read_text(errors="replace").strip().splitlines() or ["it printed nothing"]
+    return lines[-1].strip()[-_EXCERPT:]
 
 
 def outcomes_json(outcomes: Sequence[Outcome]) -> str:
-    """What became of all, for a file."""
+    """The outcomes of all studies, for a file."""
     rows = [
         {"study": o.study.name, "state": o.state, "why": o.why, "seconds": round(o.seconds, 1)}
         for o in outcomes

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pytest
 from matplotlib.figure import Figure
 
 from experiments import docs_pictures
@@ -11,6 +12,7 @@ from experiments import docs_pictures
 DOCS = Path(__file__).parents[3] / "docs"
 
 
+@pytest.mark.slow
 def test_the_command_draws_what_the_pages_show(tmp_path: Path, monkeypatch) -> None:
     # what takes longest, and has tests of its own, is drawn once: by whoever records the pictures
     monkeypatch.setattr(docs_pictures, "matching_picture", _skipped)

@@ -12,9 +12,9 @@ import pytest
 from example_position import stand_record
 
 from experiments import reproduce
+from experiments.pages.blocks import BLOCKS
 from experiments.pages.reproduction import studies
-from experiments.pages.reproduction.contents import CLAIMS, GOALS
-from experiments.pages.reproduction.document import document, to_markdown
+from experiments.pages.reproduction.document import TOPICS, document, to_markdown
 from experiments.pages.reproduction.live import Live
 from experiments.pages.reproduction.run import estimate, run_studies
 from experiments.pages.reproduction.studies import STUDIES, Study, recorded
@@ -50,7 +50,7 @@ def test_every_picture_and_anchor_of_the_page_is_there() -> None:
     headings = [slug(title) for title in re.findall(r"^#+ (.+)$", text, re.M)]
     assert len(set(headings)) == len(headings)
     links = re.findall(r"\]\(#([^)]+)\)", text)
-    assert len(links) >= len(CLAIMS) + len(GOALS)
+    assert len(links) == sum(len(topic.claims) for topic in TOPICS.values())
     assert set(links) <= set(headings)
 
 
@@ -82,7 +82,9 @@ def test_a_run_goes_on_and_names_what_failed(tmp_path, monkeypatch, capsys) -> N
         arguments=("experiments.any_pose", "--weights", "no.npz", "--out", "{folder}"),
         written="any_pose.json",
     )
-    needy = dataclasses.replace(QUICK_FINE, name="needy", record="", needs=("any_pose",))
+    needy = dataclasses.replace(
+        QUICK_FINE, name="needy", record="", arguments=("x", "{out}/any_pose/any_pose.json")
+    )
     asked = dataclasses.replace(
         QUICK_FINE, name="asked", arguments=("x", "{real_scans}"), record=""
     )
@@ -90,7 +92,12 @@ def test_a_run_goes_on_and_names_what_failed(tmp_path, monkeypatch, capsys) -> N
     settings = reproduce.make_parser().parse_args(["--out", str(tmp_path)])
     assert reproduce.main(settings) == 1
     page = (tmp_path / reproduce.FILE).read_text()
-    for words in ("no.npz", "needs any_pose, which failed", "What was run", "failed</strong>"):
+    for words in (
+        "no.npz",
+        "needs any_pose, which failed",
+        "Studies of this run",
+        "failed</strong>",
+    ):
         assert words in page, words
     assert page.count("data:image/png") == 1  # of the study that worked
     states = {o["study"]: o for o in json.loads((tmp_path / "outcomes.json").read_text())}
@@ -129,7 +136,7 @@ def test_quick_puts_live_figures_beside_recorded_ones(
         "to_page": lambda report: given.setdefault("page", report) and "",
     }.items():
         monkeypatch.setattr(reproduce, name, value)
-    monkeypatch.setattr("experiments.studies.position.report.table", lambda report: "| TABLE |")
+    monkeypatch.setitem(BLOCKS, "position", ("position", lambda report: "| TABLE |"))
     settings = reproduce.make_parser().parse_args(["--quick", "--out", str(tmp_path)])
     assert reproduce.main(settings) == 0
     text = to_markdown(given["page"])

@@ -5,17 +5,14 @@ from __future__ import annotations
 import copy
 from typing import Any
 
-import numpy as np
 import pytest
 from example_position import stand_record
 
 from experiments.pages.reproduction.claim import Claim, Verdict, digits
-from experiments.pages.reproduction.contents import CLAIMS, GOALS, OF_OURS, OF_PAPER, TOPICS
-from experiments.pages.reproduction.document import document, to_markdown
+from experiments.pages.reproduction.document import PICTURES, TOPICS, document, to_markdown
 from experiments.pages.reproduction.studies import BY_RECORD, recorded
-from experiments.pages.reproduction.topics.training import axis_errors
-from experiments.studies.public_vs_virtual.study import PUBLIC, VIRTUAL
-from vanejax.matching.metrics import mean_per_axis, mean_per_view
+
+CLAIMS = [claim for topic in TOPICS.values() for claim in topic.claims]
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +21,7 @@ def results() -> dict[str, Any]:
 
 
 def claim(words: str) -> Claim:
-    (found,) = [one for one in (*CLAIMS, *GOALS) if words in one.says]
+    (found,) = [claim for claim in CLAIMS if words in claim.says]
     return found
 
 
@@ -145,20 +142,21 @@ def test_position_is_judged_by_mean_and_largest_error(turn, shift, mean, largest
 
 
 def test_what_is_missing_is_said_to_be(results) -> None:
-    for one in (*CLAIMS, *GOALS):
+    for one in CLAIMS:
         assert (one.finding({}).verdict is Verdict.UNKNOWN) is bool(one.records), one.says
     text = to_markdown(document({}, ""))
     for study in BY_RECORD.values():
-        if study.record not in ("sensor_effects", "scaling", "tuning"):  # told of with others
+        if study.record not in ("sensor_effects", "scaling"):  # shown with others
             assert f"there is no result {study.record}." in text, study.name
 
 
-def test_every_topic_is_on_the_page_with_claims_of_one_kind() -> None:
-    assert len(TOPICS) == len(set(TOPICS))
-    assert set(TOPICS) == {*OF_PAPER, *OF_OURS}
-    assert all(topic.claims for topic in TOPICS)
-    assert all(one.place for one in CLAIMS)
-    assert not any(one.place for one in GOALS)
+def test_every_topic_is_on_the_page_with_claims_of_one_kind(results) -> None:
+    text = to_markdown(document(results, ""))
+    for topic in TOPICS.values():
+        assert text.count(f"\n## {topic.title}\n") == 1
+        assert topic.claims
+        assert {bool(claim.place) for claim in topic.claims} == {topic.of_paper}
+    assert set(PICTURES) <= set(BY_RECORD)
 
 
 @pytest.mark.parametrize(
@@ -168,25 +166,3 @@ def test_every_topic_is_on_the_page_with_claims_of_one_kind() -> None:
 )  # fmt: skip
 def test_digits(value, words) -> None:
     assert digits(value) == words
-
-
-def test_the_axis_errors_drawn_have_the_recorded_means(results, monkeypatch) -> None:
-    drawn = {}
-    monkeypatch.setattr("vanejax.plotting.axis_errors", lambda series: drawn.update(series))
-    report = results["public_vs_virtual"]
-    for views in ("hardest", "all"):
-        axis_errors(report, views)
-        for source in (PUBLIC, VIRTUAL):
-            errors = drawn[report["trained_on"][source]["title"]]
-            found = report[f"{views}_views"][source]
-            for values, name, unit in (
-                (errors.rotation_deg, "mre", "deg"),
-                (errors.translation_mm, "mte", "mm"),
-            ):
-                # six digits are recorded
-                np.testing.assert_allclose(
-                    mean_per_axis(values), found[f"{name}_per_axis_{unit}"], rtol=1e-5
-                )
-                np.testing.assert_allclose(
-                    mean_per_view(values), found[f"{name}_per_view_{unit}"], rtol=1e-5
-                )

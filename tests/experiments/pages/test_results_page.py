@@ -12,7 +12,7 @@ from experiments.pages import blocks, tables
 from experiments.pages.blocks import page, pages
 from experiments.pages.reproduction.studies import RESULTS, recorded
 from experiments.pages.summary_table import summary_table
-from experiments.runner.markdown import with_blocks
+from experiments.runner.markdown import provenance, with_blocks
 
 PAGES = pages()
 RECORDS = recorded()
@@ -74,6 +74,9 @@ def test_the_tables_follow_the_records() -> None:
     results = changed("vane", ("summary", "rotation_error_deg", "p95"), 12.34)
     assert "12.34" in tables.evaluation_table(results["vane"])
     assert "12.34" not in tables.evaluation_table(RECORDS["vane"])
+    made = provenance("x", {"date": "2026-01-02T03:04", "commit": "0123456789abcdef",
+                            "machine": {"cpu": "A processor", "cores": 2}})  # fmt: skip
+    assert made == "Record `x.json`: A processor, 2 cores; 2026-01-02, commit 0123456789."
 
 
 def time_of(name: str, seconds: float, *, goal_s=None, met=None, against=()) -> dict:
@@ -91,9 +94,7 @@ def test_times_have_their_peers_limits_and_goals() -> None:
     skipped = time_of("a peer", 0.0) | {"seconds": None, "repeats": 0, "note": "skipped: missing"}
     mine = time_of("a thing", 0.1, goal_s=0.05, met="missed", against=against)
     report = {
-        "date": "2026-01-02T03:04:05+00:00",
-        "commit": "0123456789abcdef",
-        "machine": {"cpu": "A processor", "cores": 2, "matmul_flops_per_second": 2.04e11},
+        "machine": {"matmul_flops_per_second": 2.04e11},
         "rows": [time_of("a limit", 0.05), mine, skipped],
         "scaling": [
             {
@@ -104,11 +105,8 @@ def test_times_have_their_peers_limits_and_goals() -> None:
             }
         ],
     }
-    lines = tables.performance_table(report, report).splitlines()
-    assert lines[0] == (
-        "A processor, 2 cores, 204 GFLOP/s in a large f32 product; 2026-01-02, commit 0123456789, "
-        "medians of at least 5 repeats."
-    )
+    lines = (tables.benchmark_table(report) + "\n" + tables.scaling_table(report)).splitlines()
+    assert lines[0] == "Medians of at least 5 repeats; 204 GFLOP/s in a large f32 product."
     assert "| a limit | 0.0500 | 0.0250 to 0.100 |  |  |" in lines
     assert (
         "| a thing | 0.100 | 0.0500 to 0.200 | 0.05 s: missed | 6.20 times as fast as a peer "

@@ -1,1 +1,0 @@
-"""The topics of the page, each with its claims and its section."""
