@@ -91,13 +91,14 @@ def _draw(key: jax.Array, bank: ScanBank, view: jax.Array, sampling: PairSamplin
 
 
 @functools.partial(jax.jit, static_argnames="unit_mm")
+def _fit(pair: Pair, pose: RigidTransform, unit_mm: float) -> SurfaceFit:
+    return surface_fit(pair.source.transform(pose), pair.target, unit_mm=unit_mm)
+
+
 def measure(
     pair: Pair, found: RigidTransform, unit_mm: float
 ) -> tuple[PoseErrors, SurfaceFit, SurfaceFit]:
     """Errors of a pose of one pair, and how the clouds fit under it and under the true pose."""
     truth = pair.target_from_source
-    fits = (
-        surface_fit(pair.source.transform(pose), pair.target, unit_mm=unit_mm)
-        for pose in (found, truth)
-    )
+    fits = (_fit(pair, pose, unit_mm) for pose in (found, truth))
     return pose_errors(found, truth, unit_mm=unit_mm), *fits

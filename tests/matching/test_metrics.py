@@ -12,11 +12,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from vanejax.matching import metrics
-from vanejax.matching.se3 import euler_xyz_deg, exp_se3
+from vanejax.matching.se3 import exp_se3
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
-
-ANGLE = st.floats(-180, 180)
 
 
 def cloud(xyz: np.ndarray, normals: np.ndarray | None = None, mask: np.ndarray | None = None):
@@ -44,44 +42,10 @@ def random_poses(seed: int, shape: tuple[int, ...] = ()) -> RigidTransform:
     return exp_se3(jnp.asarray(np.random.default_rng(seed).normal(size=(*shape, 6)), jnp.float32))
 
 
-# ---------------------------------------------------------------- Euler angles
-
-
-@settings(max_examples=100, deadline=None)
-@given(ANGLE, st.floats(-89.5, 89.5), ANGLE)
-def test_euler_angles_are_scipys_extrinsic_xyz(a: float, b: float, c: float) -> None:
-    rotation = Rotation.from_euler("xyz", [a, b, c], degrees=True).as_matrix()
-    found = np.asarray(euler_xyz_deg(jnp.asarray(rotation, jnp.float32)), np.float64)
-    difference = (found - [a, b, c] + 180) % 360 - 180
-    # float32 eps in degrees is 7e-6; within 0.5 deg of the lock it is divided by cos(89.5) = 0.009
-    np.testing.assert_allclose(difference, 0, atol=5e-3)
-
-
-@pytest.mark.parametrize("b", [90.0, -90.0])
-@pytest.mark.parametrize("a", [-170.0, 0.0, 35.0])
-def test_euler_angles_at_the_lock_still_give_the_rotation(a: float, b: float) -> None:
-    rotation = Rotation.from_euler("xyz", [a, b, 20.0], degrees=True).as_matrix()
-    # exactly locked, as no float32 product is
-    rotation[np.abs(rotation) < 1e-7] = 0
-    found = np.asarray(euler_xyz_deg(jnp.asarray(rotation, jnp.float32)))
-    assert found[2] == 0
-    again = Rotation.from_euler("xyz", found, degrees=True).as_matrix()
-    np.testing.assert_allclose(again, rotation, atol=1e-6)  # f32 eps x 10
-
-
-@pytest.mark.parametrize("shape", [(), (1,), (3, 1, 2)])
-def test_euler_angles_keep_leading_axes(shape: tuple[int, ...]) -> None:
-    poses = random_poses(0, shape)
-    found = euler_xyz_deg(poses.rotation)
-    assert found.shape == (*shape, 3)
-    again = Rotation.from_euler("xyz", np.asarray(found).reshape(-1, 3), degrees=True).as_matrix()
-    np.testing.assert_allclose(again.reshape(*shape, 3, 3), poses.rotation, atol=2e-6)  # f32
-
-
 # ---------------------------------------------------------------- pose errors
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 179), st.floats(0, 2))
 def test_a_known_error_is_measured(seed: int, angle_deg: float, length: float) -> None:
     rng = np.random.default_rng(seed)
@@ -125,13 +89,18 @@ def test_axis_errors_are_differences_of_angles_and_translations() -> None:
     np.testing.assert_allclose(errors.translation_axes_mm, [5.0, 20.0, 0.0], atol=1e-5)
 
 
-def test_axis_errors_wrap_at_half_a_turn() -> None:
+@pytest.mark.parametrize("shape", [(), (1,), (3, 1, 2)])
+def test_axis_errors_wrap_at_half_a_turn_and_keep_leading_axes(shape: tuple[int, ...]) -> None:
     def about_z(angle_deg: float) -> RigidTransform:
         matrix = Rotation.from_euler("z", angle_deg, degrees=True).as_matrix()
-        return RigidTransform(jnp.asarray(matrix, jnp.float32), jnp.zeros(3))
+        return RigidTransform(
+            jnp.broadcast_to(jnp.asarray(matrix, jnp.float32), (*shape, 3, 3)),
+            jnp.zeros((*shape, 3)),
+        )
 
-    value = metrics.rotation_error_axes_deg(about_z(179.0), about_z(-179.0))
-    np.testing.assert_allclose(value, [0, 0, 2], atol=1e-4)  # f32 eps of 180
+    value = metrics.pose_errors(about_z(179.0), about_z(-179.0), unit_mm=1.0).rotation_axes_deg
+    expected = np.broadcast_to([0, 0, 2], (*shape, 3))
+    np.testing.assert_allclose(value, expected, atol=1e-4)  # f32 eps of 180
 
 
 def test_no_error_is_zero() -> None:
@@ -148,17 +117,16 @@ def test_means_over_views_and_over_axes() -> None:
 
 
 def test_a_pose_that_is_not_finite_stays_so() -> None:
-    lost = RigidTransform(jnp.full((3, 3), jnp.nan), jnp.zeros(3))
-    errors = metrics.pose_errors(lost, RigidTransform.identity(), unit_mm=1.0)
-    assert np.isnan(errors.rotation_deg)
-    assert np.isnan(errors.translation_mm)
-    assert np.isnan(errors.rotation_axes_deg).all()
+    lost = RigidTransform(np.float32([np.eye(3), np.full((3, 3), np.nan)]), np.zeros((2, 3)))
+    errors = metrics.pose_errors(lost, RigidTransform.identity((2,)), unit_mm=1.0)
+    for leaf in (errors.rotation_deg, errors.translation_mm, errors.rotation_axes_deg):
+        np.testing.assert_array_equal(np.isnan(leaf).reshape(2, -1).all(axis=1), [False, True])
 
 
 # ---------------------------------------------------------------- RMSE and FFMDE
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 60))
 def test_surface_fit_against_a_kd_tree(seed: int, num_source: int, num_reference: int) -> None:
     source, reference = random_cloud(seed, 40), random_cloud(seed + 1, 60)
@@ -201,10 +169,10 @@ def test_ffmde_does_not_see_a_slide_along_the_surface_but_rmse_does() -> None:
     np.testing.assert_allclose(fit.rmse_mm, 1.0, rtol=1e-6)
 
 
-@pytest.mark.parametrize("junk", [0.0, 1e6, np.nan])
+@pytest.mark.parametrize("junk", [1e6, np.nan])
 def test_padding_changes_nothing(junk: float) -> None:
     source, reference = random_cloud(5, 20), random_cloud(6, 30)
-    alone = metrics.surface_fit(source, reference, unit_mm=1.0)
+    alone = fit_of_70_mm(source, reference)
 
     def padded(points: PointCloud) -> PointCloud:
         pad = np.full((7, 3), junk, np.float32)
@@ -214,7 +182,7 @@ def test_padding_changes_nothing(junk: float) -> None:
             mask=jnp.concatenate([points.mask, np.zeros(7, bool)]),
         )
 
-    fit = metrics.surface_fit(padded(source), padded(reference), unit_mm=1.0)
+    fit = fit_of_70_mm(padded(source), padded(reference))
     for with_padding, without in zip(jax.tree.leaves(fit), jax.tree.leaves(alone), strict=True):
         # only the order of a float32 sum of 20 may differ
         np.testing.assert_allclose(with_padding, without, rtol=1e-6)
@@ -240,23 +208,6 @@ def test_without_points_there_is_no_fit(empty: str) -> None:
     pair = (nothing(source), reference) if empty == "source" else (source, nothing(reference))
     fit = metrics.surface_fit(*pair, unit_mm=1.0)
     assert all(np.isnan(leaf) for leaf in jax.tree.leaves(fit))
-
-
-def test_a_source_moved_nowhere_has_no_fit() -> None:
-    source = random_cloud(11, 4)
-    lost = source.replace(xyz=jnp.full_like(source.xyz, jnp.nan))
-    fit = metrics.surface_fit(lost, random_cloud(12, 5), unit_mm=1.0)
-    assert all(np.isnan(leaf) for leaf in jax.tree.leaves(fit))
-
-
-def test_surface_fit_under_vmap_is_the_same_pair_by_pair() -> None:
-    sources = [random_cloud(seed, 16) for seed in (20, 21, 22)]
-    reference = random_cloud(23, 24)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *sources)
-    together = jax.vmap(lambda s: metrics.surface_fit(s, reference, unit_mm=3.0))(stacked)
-    for index, source in enumerate(sources):
-        alone = metrics.surface_fit(source, reference, unit_mm=3.0)
-        np.testing.assert_allclose(together.rmse_mm[index], alone.rmse_mm, rtol=1e-6)  # f32
 
 
 # ---------------------------------------------------------------- summaries

@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FunctionType
 
 import pytest
-import test_contract
+import registration_contract
 import test_verdict
 from absl import flags
 from test_architecture import GROUND, WINGS
@@ -445,21 +445,12 @@ def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch) -> None:
         exec(compile(code, f"{name}.md", "exec"), space)
 
 
-def test_the_method_of_the_page_keeps_the_contract(monkeypatch) -> None:
+def test_the_method_of_the_page_keeps_the_contract() -> None:
     text = (ROOT / "docs" / "adding_a_method.md").read_text()
     space: dict[str, object] = {}
     exec(compile(blocks(text, "python")[0][1], "adding_a_method.md", "exec"), space)
     with pytest.raises(InputError, match="max_distance"):
         space["pca"](max_distance=0)
-    monkeypatch.setitem(test_contract.CASES, "PCA", test_contract.Case(space["pca"]))
-    for test in (
-        "perturbed",
-        "swapped",
-        "the_guess_is_part_of_the_answer",
-        "padding_is_irrelevant",
-    ):
-        seed = (0,) if test == "perturbed" else ()
-        getattr(test_contract, f"test_{test}")("PCA", *seed)
-    for what in ("no source", "no target", "nothing"):
-        test_contract.test_without_overlap_nothing_is_claimed("PCA", what)
-    test_contract.test_a_batch_is_its_pairs("PCA")
+    case = registration_contract.Case(space["pca"])
+    for law in registration_contract.LAWS:
+        law(case)

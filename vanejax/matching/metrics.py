@@ -1,20 +1,22 @@
 """The paper's measures of a registration, and two that do not depend on a choice of axes.
 
-Everything here is unbatched or works over leading axes, pure and JAX, but for `summary`. Poses and
-clouds come in one unit, unit-sphere units as a rule, with the part's centre at the origin of the
-target's frame; ``unit_mm`` is the length of that unit in mm (the part's radius), and results are
-in millimetres and degrees. What is not finite stays not finite: only `summary` leaves it out, and
-it says how often.
+Poses and clouds come in one unit, unit-sphere units as a rule, with the part's centre at the origin
+of the target's frame; ``unit_mm`` is the length of that unit in mm (the part's radius), and results
+are in millimetres and degrees. What is not finite stays not finite: only `summary` leaves it out,
+and counts it. `pose_errors` and `summary` run on the host, the rest is pure JAX.
 """
 
 from __future__ import annotations
+
+import functools
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from vanejax.matching.se3 import euler_xyz_deg, rotation_angle
+from vanejax.matching.se3 import rotation_angle
 from vanejax.pointcloud import PointCloud, nearest_neighbors
 from vanejax.rigid import RigidTransform
 
@@ -41,13 +43,15 @@ class PoseErrors:
     Attributes:
       rotation_deg: [...] see `rotation_error_deg`.
       translation_mm: [...] see `translation_error`.
-      rotation_axes_deg: [..., 3] see `rotation_error_axes_deg`.
-      translation_axes_mm: [..., 3] see `translation_error_axes`.
+      rotation_axes_deg: [..., 3] f64, |R^(k) - Rt^(k)| for k = x, y, z, the terms of eqs 8 and 10.
+        Euler angles about the fixed x, y and z axes, in this order, as the published RPM-Net's
+        evaluation takes them; the paper does not say. Differences are wrapped: 0 to 180.
+      translation_axes_mm: [..., 3] |T^(k) - Tt^(k)|, the terms of eqs 9 and 11.
     """
 
     rotation_deg: jax.Array
     translation_mm: jax.Array
-    rotation_axes_deg: jax.Array
+    rotation_axes_deg: np.ndarray
     translation_axes_mm: jax.Array
 
 
@@ -69,32 +73,6 @@ def translation_error(found: RigidTransform, truth: RigidTransform) -> jax.Array
     return jnp.linalg.norm((found @ truth.inverse()).translation, axis=-1)
 
 
-def rotation_error_axes_deg(found: RigidTransform, truth: RigidTransform) -> jax.Array:
-    """|R^(k) - Rt^(k)| for k = x, y, z: the terms of eqs 8 and 10, [..., 3] in degrees.
-
-    Euler angles about the fixed x, y and z axes, in this order (`rigid.euler_xyz_deg`), as the
-    published RPM-Net's evaluation takes them; the paper does not say. Differences are wrapped, so
-    that 179 and -179 deg are 2 deg apart: values from 0 to 180.
-    """
-    difference = euler_xyz_deg(found.rotation) - euler_xyz_deg(truth.rotation)
-    return jnp.abs(jnp.mod(difference + 180.0, 360.0) - 180.0)
-
-
-def translation_error_axes(found: RigidTransform, truth: RigidTransform) -> jax.Array:
-    """|T^(k) - Tt^(k)| for k = x, y, z: the terms of eqs 9 and 11, [..., 3], poses' unit."""
-    return jnp.abs(found.translation - truth.translation)
-
-
-def pose_errors(found: RigidTransform, truth: RigidTransform, *, unit_mm: float) -> PoseErrors:
-    """All errors of poses target_from_source whose unit is ``unit_mm`` mm long."""
-    return PoseErrors(
-        rotation_deg=rotation_error_deg(found, truth),
-        translation_mm=unit_mm * translation_error(found, truth),
-        rotation_axes_deg=rotation_error_axes_deg(found, truth),
-        translation_axes_mm=unit_mm * translation_error_axes(found, truth),
-    )
-
-
 def pose_metrics(found: RigidTransform, truth: RigidTransform) -> dict[str, jax.Array]:
     """Rotation error in degrees and translation error in unit-sphere units, [...] each."""
     return {
@@ -103,27 +81,37 @@ def pose_metrics(found: RigidTransform, truth: RigidTransform) -> dict[str, jax.
     }
 
 
+def pose_errors(found: RigidTransform, truth: RigidTransform, *, unit_mm: float) -> PoseErrors:
+    """All errors of poses target_from_source whose unit is ``unit_mm`` mm long; on the host."""
+    errors = _pose_metrics(found, truth)
+    turned = _euler_xyz_deg(found.rotation) - _euler_xyz_deg(truth.rotation)
+    return PoseErrors(
+        rotation_deg=errors["rotation_error_deg"],
+        translation_mm=unit_mm * errors["translation_error"],
+        rotation_axes_deg=np.abs((turned + 180.0) % 360.0 - 180.0),
+        translation_axes_mm=unit_mm * abs(found.translation - truth.translation),
+    )
+
+
+_pose_metrics = jax.jit(pose_metrics)
+
+
+def _euler_xyz_deg(rotation: jax.Array) -> np.ndarray:
+    """Angles [..., 3] f64 in degrees about the fixed axes x, y, z; NaN where not finite."""
+    matrices = np.asarray(rotation, np.float64).reshape(-1, 3, 3)
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    angles = np.full((len(matrices), 3), np.nan)
+    angles[finite] = Rotation.from_matrix(matrices[finite]).as_euler("xyz", degrees=True)
+    return angles.reshape(rotation.shape[:-1])
+
+
 def mean_per_axis(axis_errors: jax.Array) -> jax.Array:
-    """MRE_k (eq. 8) or MTE_k (eq. 9), k = x, y, z: ``sum_i e_i^(k) / N`` over N views.
-
-    Args:
-      axis_errors: [V, 3], degrees or mm, of `PoseErrors`.
-
-    Returns:
-      [3], same unit.
-    """
+    """MRE_k (eq. 8) or MTE_k (eq. 9), k = x, y, z: mean [3] over the views of errors [V, 3]."""
     return jnp.mean(axis_errors, axis=0)
 
 
 def mean_per_view(axis_errors: jax.Array) -> jax.Array:
-    """MRE_j (eq. 10) or MTE_j (eq. 11): ``sum_k e_j^(k) / 3`` over the axes, for each view j.
-
-    Args:
-      axis_errors: [V, 3], degrees or mm, of `PoseErrors`.
-
-    Returns:
-      [V], same unit.
-    """
+    """MRE_j (eq. 10) or MTE_j (eq. 11) of view j: mean [V] over the axes of errors [V, 3]."""
     return jnp.mean(axis_errors, axis=-1)
 
 
@@ -165,13 +153,7 @@ def ffmde_abs(offsets: jax.Array, normals: jax.Array, mask: jax.Array) -> jax.Ar
 
 
 def surface_fit(moved: PointCloud, reference: PointCloud, *, unit_mm: float) -> SurfaceFit:
-    """RMSE and FFMDE of a source [N] moved onto a reference [M], one nearest-point search for all.
-
-    Args:
-      moved: the source under the found pose.
-      reference: with unit normals, in the same frame and unit.
-      unit_mm: length of that unit in mm.
-    """
+    """RMSE and FFMDE of a source [N], moved by the found pose, on a reference [M] with normals."""
     offsets, normals = nearest_offsets(moved, reference)
     return SurfaceFit(
         rmse_mm=unit_mm * rmse(offsets, moved.mask),
@@ -181,27 +163,18 @@ def surface_fit(moved: PointCloud, reference: PointCloud, *, unit_mm: float) -> 
 
 
 def summary(values: np.ndarray) -> dict[str, float | int]:
-    """Mean, median, p95 and max of the finite values, and how many are not finite.
+    """``mean``, ``median``, ``p95``, ``max`` of the finite values, and how many are ``non_finite``.
 
-    Args:
-      values: any shape, on the host.
-
-    Returns:
-      ``mean``, ``median``, ``p95`` (linear interpolation between ranks), ``max``: floats, NaN if
-      nothing is finite; ``non_finite``: int, left out of the other four.
+    The first four are NaN if nothing is finite; p95 interpolates between ranks.
     """
     values = np.asarray(values, np.float64).ravel()
     finite = values[np.isfinite(values)]
-    lost = int(values.size - finite.size)
-    if not finite.size:
-        return dict.fromkeys(("mean", "median", "p95", "max"), float("nan")) | {"non_finite": lost}
+    p95 = functools.partial(np.percentile, q=95)
+    measures = {"mean": np.mean, "median": np.median, "p95": p95, "max": np.max}
     return {
-        "mean": float(np.mean(finite)),
-        "median": float(np.median(finite)),
-        "p95": float(np.percentile(finite, 95)),
-        "max": float(np.max(finite)),
-        "non_finite": lost,
-    }
+        name: float(measure(finite)) if finite.size else float("nan")
+        for name, measure in measures.items()
+    } | {"non_finite": int(values.size - finite.size)}
 
 
 def _mean(values: jax.Array, mask: jax.Array) -> jax.Array:

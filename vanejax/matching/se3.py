@@ -128,24 +128,3 @@ def rotation_angle(rotation: jax.Array) -> jax.Array:
     zero = squared == 0
     sine = jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
     return jnp.arctan2(sine, jnp.trace(rotation, axis1=-2, axis2=-1) - 1)
-
-
-def euler_xyz_deg(rotation: jax.Array) -> jax.Array:
-    """Angles [..., 3] in degrees about the fixed axes x, y, z, turned about in this order.
-
-    ``R = Rz(c) Ry(b) Rx(a)`` gives (a, b, c), with a and c in (-180, 180] and b in [-90, 90]:
-    scipy's ``as_euler("xyz")``. At b = +-90 deg only the sum or difference of a and c is defined;
-    there c is 0.
-    """
-    r = rotation
-    cosine = jnp.hypot(r[..., 0, 0], r[..., 1, 0])
-    # below this the matrix's rounding decides the two arc tangents
-    locked = cosine < 10 * jnp.finfo(r.dtype).eps
-    a = jnp.where(
-        locked,
-        jnp.arctan2(-r[..., 1, 2], r[..., 1, 1]),
-        jnp.arctan2(r[..., 2, 1], r[..., 2, 2]),
-    )
-    b = jnp.arctan2(-r[..., 2, 0], cosine)
-    c = jnp.where(locked, 0.0, jnp.arctan2(r[..., 1, 0], r[..., 0, 0]))
-    return jnp.rad2deg(jnp.stack([a, b, c], -1))
