@@ -1,4 +1,4 @@
-"""What every `vanejax.matching.contract.Register` promises, as laws, and the methods that do.
+"""The laws of `vanejax.matching.contract.Register`, and the methods that must keep them.
 
 The classical methods must also find the pose. Networks come with random weights: what they promise
 for any weights is asked here, what training gives is the matter of their own tests.
