@@ -140,7 +140,11 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
     kind = "text" if b"\0" not in head and head.isascii() else "binary"
     known = ", ".join(dict.fromkeys((*point_file.READERS, *cad_file.READERS, ".json")))
     note = f"not a file that vanejax reads: {known}"
-    return Inspection(str(path), "unknown", kind, path.stat().st_size, notes=(note,))
+    return _inspection(path, "unknown", kind, notes=(note,))
+
+
+def _inspection(path: Path, kind: Kind, written: str, **findings: Any) -> Inspection:
+    return Inspection(str(path), kind, written, path.stat().st_size, **findings)
 
 
 def _inspect_cloud(path: Path, file: PointFile) -> Inspection:
@@ -163,21 +167,19 @@ def _inspect_cloud(path: Path, file: PointFile) -> Inspection:
     origin = np.zeros(3) if file.viewpoint is None else file.viewpoint
     place = "the origin" if file.viewpoint is None else f"the file's viewpoint {origin}"
     why = why_not_from(points, origin)
-    fits = not why
-    looks = MeasuredScan(points, None, origin).looks_along if fits else None
-    sensor = f"can have stood at {place}" if fits else f"{place} {why}"
+    looks = None if why else MeasuredScan(points, None, origin).looks_along
+    sensor = f"{place} {why}" if why else f"can have stood at {place}"
     if looks:
         sensor += f", looking along {looks}"
-    steps = [f"vanejax register {shlex.quote(str(path))} PART.stl" + _option("scan", units)]
-    if not fits:
-        steps.append(f"{steps[0]} --sensor-origin 0,0,0   # if the sensor was there")
-    if len(points) < MIN_POINTS:
-        steps = []
-    return Inspection(
-        path=str(path),
-        kind="point cloud",
-        format=file.format,
-        size_bytes=path.stat().st_size,
+    steps = []
+    if len(points) >= MIN_POINTS:
+        steps = [f"vanejax register {shlex.quote(str(path))} PART.stl" + _option("scan", units)]
+        if why:
+            steps.append(f"{steps[0]} --sensor-origin 0,0,0   # if the sensor was there")
+    return _inspection(
+        path,
+        "point cloud",
+        file.format,
         points=len(file.points),
         extent=_extent(points),
         units=units,
@@ -187,7 +189,7 @@ def _inspect_cloud(path: Path, file: PointFile) -> Inspection:
         spacing=_spacing(points),
         normals=_normals_in_words(points, normals, origin),
         sensor=sensor,
-        sensor_origin=tuple(origin.tolist()) if fits else None,
+        sensor_origin=None if why else tuple(origin.tolist()),
         looks_along=looks,
         notes=tuple(notes),
         next_steps=tuple(steps),
@@ -244,11 +246,10 @@ def _inspect_mesh(path: Path, written: str) -> Inspection:
         if path.suffix.lower() == ".ply":
             option = _option("scan", units)
             steps = (f"vanejax register {name} PART.stl{option}   # if this is a scan",)
-    return Inspection(
-        path=str(path),
-        kind="mesh",
-        format=written,
-        size_bytes=path.stat().st_size,
+    return _inspection(
+        path,
+        "mesh",
+        written,
         points=len(vertices),
         faces=len(faces),
         extent=extent,
@@ -294,11 +295,10 @@ def _inspect_weights(path: Path, arrays: dict[str, str]) -> Inspection:
         f"{matcher.sampling.num_reference:,} reference and up to {matcher.sampling.num_source:,} "
         f"source points, {matcher.iterations} iterations",
     )
-    return Inspection(
-        path=str(path),
-        kind="weights",
-        format="NumPy archive of vanejax",
-        size_bytes=path.stat().st_size,
+    return _inspection(
+        path,
+        "weights",
+        "NumPy archive of vanejax",
         notes=notes,
         next_steps=(f"vanejax register SCAN.ply PART.stl --weights {shlex.quote(str(path))}",),
     )
@@ -308,52 +308,46 @@ def _inspect_arrays(path: Path, arrays: dict[str, str]) -> Inspection:
     shown = [f"{name}: {shape}" for name, shape in list(arrays.items())[:20]]
     if len(arrays) > len(shown):
         shown.append(f"and {len(arrays) - len(shown)} more arrays")
-    return Inspection(
-        path=str(path),
-        kind="arrays",
-        format="NumPy archive",
-        size_bytes=path.stat().st_size,
+    return _inspection(
+        path,
+        "arrays",
+        "NumPy archive",
         notes=(*shown, "a scan would have an array 'points' or 'xyz'"),
     )
 
 
 def _array_names(path: Path) -> dict[str, str]:
     """Shape and type, in words, by name of the arrays in an archive; nothing else is read."""
-    found = {}
+    words = {}
     try:
         with zipfile.ZipFile(path) as archive:
             for info in archive.infolist():
+                name = info.filename.removesuffix(".npy")
                 with archive.open(info) as file:
-                    found[info.filename.removesuffix(".npy")] = _array_in_words(file)
+                    try:
+                        shape, _, dtype = array_header(file)
+                        words[name] = f"{list(shape)} {dtype}"
+                    except ValueError:
+                        words[name] = "no array"
     except Exception as error:  # a damaged archive can raise anything: zlib's, struct's, zipfile's
         raise InputError(f"{path}: damaged: {error}; copy or export it again") from error
-    return found
-
-
-def _array_in_words(file: Any) -> str:
-    try:
-        shape, _, dtype = array_header(file)
-    except ValueError:
-        return "no array"
-    return f"{list(shape)} {dtype}"
+    return words
 
 
 def _inspect_json(path: Path) -> Inspection:
     from vanejax.machine.pose_file import read_pose
 
-    size, name = path.stat().st_size, shlex.quote(str(path))
     try:
         pose = read_pose(path)
     except InputError as error:
-        return Inspection(str(path), "unknown", "JSON", size, notes=(str(error),))
+        return _inspection(path, "unknown", "JSON", notes=(str(error),))
     back = np.asarray(pose.inverse().translation)
-    return Inspection(
-        path=str(path),
-        kind="pose",
-        format="JSON",
-        size_bytes=size,
+    return _inspection(
+        path,
+        "pose",
+        "JSON",
         notes=(f"part_from_camera; the part is at {np.round(back, 3)} mm in the scan",),
-        next_steps=(f"vanejax register SCAN.ply PART.stl --init {name}",),
+        next_steps=(f"vanejax register SCAN.ply PART.stl --init {shlex.quote(str(path))}",),
     )
 
 
@@ -394,8 +388,5 @@ def _spacing(points: np.ndarray) -> float | None:
 
 
 def _bytes(size: int) -> str:
-    for unit in ("bytes", "kB", "MB"):
-        if size < 1000:
-            return f"{size:.3g} {unit}"
-        size /= 1000
-    return f"{size:.3g} GB"
+    power = min(3, max(0, len(str(size)) - 1) // 3)
+    return f"{size / 1000**power:.3g} {('bytes', 'kB', 'MB', 'GB')[power]}"
