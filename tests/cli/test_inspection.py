@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from test_cad_file import step
+from example_step import step
 
 from vanejax.cad.cad_file import MM_PER_UNIT, read_triangles
 from vanejax.cad.parametric_vane import guide_vane

@@ -128,6 +128,8 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
             return _inspect_weights(path, arrays)
         if not {"points", "xyz"} & set(arrays):
             return _inspect_arrays(path, arrays)
+    if suffix == ".safetensors":
+        return _inspect_weights(path, {})
     if suffix in point_file.READERS:
         file = read_points(path)
         if file.num_faces:
@@ -138,7 +140,9 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
     if suffix == ".json":
         return _inspect_json(path)
     kind = "text" if b"\0" not in head and head.isascii() else "binary"
-    known = ", ".join(dict.fromkeys((*point_file.READERS, *cad_file.READERS, ".json")))
+    known = ", ".join(
+        dict.fromkeys((*point_file.READERS, *cad_file.READERS, ".json", ".safetensors"))
+    )
     note = f"not a file that vanejax reads: {known}"
     return _inspection(path, "unknown", kind, notes=(note,))
 
@@ -298,7 +302,7 @@ def _inspect_weights(path: Path, arrays: dict[str, str]) -> Inspection:
     return _inspection(
         path,
         "weights",
-        "NumPy archive of vanejax",
+        "safetensors of vanejax" if path.suffix == ".safetensors" else "NumPy archive of vanejax",
         notes=notes,
         next_steps=(f"vanejax register SCAN.ply PART.stl --weights {shlex.quote(str(path))}",),
     )

@@ -26,8 +26,16 @@ from tqdm import tqdm
 from experiments.runner import study_command as study
 from experiments.runner.vane_views import VaneViews, magnitudes, pose_error
 from experiments.studies.position import report as position_report
-from experiments.studies.position import virtual_stand as stand
-from experiments.studies.position.virtual_stand import Stand
+from experiments.studies.position.virtual_test_stand import (
+    VirtualTestStand,
+    calibration_errors,
+    calibrations,
+    frame_bias,
+    place_cubes,
+    pose_bias,
+    stage_moves,
+    stage_turns,
+)
 from vanejax.errors import InputError
 from vanejax.localization.registration import register
 from vanejax.machine.calibration import Calibration
@@ -75,7 +83,7 @@ class Found:
 
 
 def find(
-    one: Stand,
+    stand: VirtualTestStand,
     positions: Sequence[RigidTransform],
     first: Found | None,
     *,
@@ -91,20 +99,20 @@ def find(
     found = [] if first is None else [first]
     for number in range(len(found), len(positions)):
         rng = np.random.default_rng([seed, _SCAN, salt, number])
-        scan = one.scan(positions[number], rng)
+        scan = stand.scan(positions[number], rng)
         init = None
         if found:
-            init = found[0].pose @ one.expected(positions[number]).inverse()
+            init = found[0].pose @ stand.expected(positions[number]).inverse()
         began = time.perf_counter()
-        result = register(scan, one.part, init=init, weights=weights, seed=seed)
+        result = register(scan, stand.part, init=init, weights=weights, seed=seed)
         seconds = time.perf_counter() - began
         pose = result.part_from_camera
         found.append(
             Found(
                 pose,
-                one.truth(positions[number]),
+                stand.truth(positions[number]),
                 result.uncertainty.covariance,
-                stand.pose_bias(one, scan, pose, errors),
+                pose_bias(stand, scan, pose, errors),
                 result.verdict.status,
                 seconds,
             )
@@ -123,20 +131,22 @@ def single(found: Found, center: np.ndarray) -> dict[str, Any]:
     }
 
 
-def turn_rows(one: Stand, positions: list[RigidTransform], found: list[Found]) -> dict[str, Any]:
+def turn_rows(
+    stand: VirtualTestStand, positions: list[RigidTransform], found: list[Found]
+) -> dict[str, Any]:
     """Every position's turn against the stage's (Fig. 15a).
 
     The angle is that about the axis which all measured turns share; the drawing gives its sign.
     """
     motions = [camera_motion(found[0].pose, other.pose) for other in found[1:]]
     axis = common_axis(np.stack([motion.rotation for motion in motions]))
-    if axis @ one.axis < 0:
+    if axis @ stand.axis < 0:
         axis = -axis
     rows = []
     for stage, motion, other in zip(positions[1:], motions, found[1:], strict=True):
         true_deg = twist_about(stage.rotation, np.array([0.0, 0.0, 1.0])).angle_deg
         twist = twist_about(motion.rotation, axis)
-        ways = motion_errors(found[0].pose, other.pose, one.part.center)
+        ways = motion_errors(found[0].pose, other.pose, stand.part.center)
         noise = ways.covariance(found[0].covariance, other.covariance)
         common = ways.common(found[0].bias, other.bias)
         both = noise + common @ common.T
@@ -151,15 +161,15 @@ def turn_rows(one: Stand, positions: list[RigidTransform], found: list[Found]) -
                 "whole_mm": translation_mm,
                 "sigma_deg": angle_sigma_deg(both, motion.rotation, axis),
                 "sigma_noise_deg": angle_sigma_deg(noise, motion.rotation, axis),
-                "single": single(other, one.part.center),
+                "single": single(other, stand.part.center),
             }
         )
-    true_axis = one.camera_from_stage.rotation[:, 2]
+    true_axis = stand.camera_from_stage.rotation[:, 2]
     return {"axis_error_deg": _between_deg(axis, true_axis), "rows": rows}
 
 
 def move_rows(
-    one: Stand,
+    stand: VirtualTestStand,
     positions: list[RigidTransform],
     found: list[Found],
     calibration: Calibration,
@@ -174,28 +184,28 @@ def move_rows(
     which is that of the point at the machine's origin.
     """
     probed = [
-        one.probed(stage, np.random.default_rng([seed, _PROBE, salt, number]))
+        stand.probed(stage, np.random.default_rng([seed, _PROBE, salt, number]))
         for number, stage in enumerate(positions)
     ]
     rows = []
     for stage, other, touched in zip(positions[1:], found[1:], probed[1:], strict=True):
         seen = camera_motion(found[0].pose, other.pose)
-        true_seen = one.moved(stage)
+        true_seen = stand.moved(stage)
         probe = probe_translation(probed[0], touched)
         moved = {}
         for name, frame in (
             ("estimated", calibration.machine_from_camera),
-            ("known", one.machine_from_camera),
+            ("known", stand.machine_from_camera),
         ):
             motion = in_machine(seen, frame)
-            start = (frame @ found[0].pose.inverse()).apply(one.part.center[None])[0]
+            start = (frame @ found[0].pose.inverse()).apply(stand.part.center[None])[0]
             moved[name] = (motion, start, displacement(motion, start))
         motion, start, way = moved["estimated"]
-        truth = in_machine(true_seen, one.machine_from_camera).translation  # it turns nothing
+        truth = in_machine(true_seen, stand.machine_from_camera).translation  # it turns nothing
         ways = motion_errors(
             found[0].pose,
             other.pose,
-            one.part.center,
+            stand.part.center,
             machine_from_camera=calibration.machine_from_camera,
             calibration_center=calibration.center,
         )
@@ -205,7 +215,7 @@ def move_rows(
         for name, covariance in (("noise", noise), ("both", noise + common @ common.T)):
             carried = displacement_covariance(covariance, ways.center, start + way)
             sigmas[name] = float(np.sqrt(np.trace(carried)))
-        whole = pose_error(motion, in_machine(true_seen, one.machine_from_camera), ways.center)
+        whole = pose_error(motion, in_machine(true_seen, stand.machine_from_camera), ways.center)
         rows.append(
             {
                 "stage_mm": stage.translation,
@@ -220,7 +230,7 @@ def move_rows(
                 "whole_mm": magnitudes(whole)[1],
                 "sigma_mm": sigmas["both"],
                 "sigma_noise_mm": sigmas["noise"],
-                "single": single(other, one.part.center),
+                "single": single(other, stand.part.center),
             }
         )
     return rows
@@ -230,13 +240,13 @@ def _length(vector: np.ndarray) -> float:
     return float(np.linalg.norm(vector))
 
 
-def _between_deg(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.degrees(np.arctan2(_length(np.cross(one, other)), one @ other)))
+def _between_deg(first: np.ndarray, second: np.ndarray) -> float:
+    return float(np.degrees(np.arctan2(_length(np.cross(first, second)), first @ second)))
 
 
-def calibration_row(found: Calibration, one: Stand) -> dict[str, float]:
+def calibration_row(found: Calibration, stand: VirtualTestStand) -> dict[str, float]:
     """How good a calibration is, and how good it says it is."""
-    error = pose_error(found.machine_from_camera, one.machine_from_camera, found.center)
+    error = pose_error(found.machine_from_camera, stand.machine_from_camera, found.center)
     rotation_deg, translation_mm = magnitudes(error)
     return {
         "rotation_deg": rotation_deg,
@@ -286,31 +296,31 @@ def run_camera(
     rng = np.random.default_rng([seed, _STAND, view])
     kind = preset(SENSOR)
     camera_from_part = views.viewpoints.view(view)
-    one = Stand.built(views.part, kind.sample(rng), camera_from_part, rng)
-    errors = stand.causes(kind)
-    turned, moved = stand.turns(positions), stand.moves(positions)
+    stand = VirtualTestStand.build(views.part, kind.sample(rng), camera_from_part, rng)
+    errors = calibration_errors(kind)
+    turned, moved = stage_turns(positions), stage_moves(positions)
     shared = {"errors": errors, "weights": weights, "seed": seed}
-    turns = find(one, turned, None, salt=2 * view, **shared)
-    moves = find(one, moved, turns[0], salt=2 * view + 1, **shared)
-    placed = stand.place_cubes(one, np.random.default_rng([seed, _CUBE, view]))
-    joint, mean = stand.calibrations(placed)
-    bias = stand.frame_bias(placed, joint, errors)
-    joint_row = calibration_row(joint, one)
+    turns = find(stand, turned, None, salt=2 * view, **shared)
+    moves = find(stand, moved, turns[0], salt=2 * view + 1, **shared)
+    placed = place_cubes(stand, np.random.default_rng([seed, _CUBE, view]))
+    joint, mean = calibrations(placed)
+    bias = frame_bias(placed, joint, errors)
+    joint_row = calibration_row(joint, stand)
     spread = np.sum(bias**2, axis=1)
     joint_row["bias_sigma_deg"] = float(np.degrees(np.sqrt(spread[:3].sum())))
     joint_row["bias_sigma_mm"] = float(np.sqrt(spread[3:].sum()))
     return {
         "view": view,
         "machine_mm": _length(
-            (one.machine_from_camera @ camera_from_part).apply(one.part.center[None])[0]
+            (stand.machine_from_camera @ camera_from_part).apply(stand.part.center[None])[0]
         ),
-        "first": single(turns[0], one.part.center),
-        "rotation": turn_rows(one, turned, turns),
-        "translation": move_rows(one, moved, moves, joint, bias, seed=seed, salt=view),
-        "calibration": {"joint": joint_row, "mean": calibration_row(mean, one)},
+        "first": single(turns[0], stand.part.center),
+        "rotation": turn_rows(stand, turned, turns),
+        "translation": move_rows(stand, moved, moves, joint, bias, seed=seed, salt=view),
+        "calibration": {"joint": joint_row, "mean": calibration_row(mean, stand)},
         "bias": {
-            "turns": bias_shares(turns, one.part.center),
-            "moves": bias_shares(moves, one.part.center),
+            "turns": bias_shares(turns, stand.part.center),
+            "moves": bias_shares(moves, stand.part.center),
         },
     }
 
@@ -321,7 +331,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     chosen = views.select(settings.views)
     if settings.positions < 3:
         raise InputError(f"--positions {settings.positions}: at least 3 are needed for an axis")
-    stand.moves(settings.positions)
+    stage_moves(settings.positions)
     weights = None
     if settings.weights is not None:
         weights = find_weights(settings.weights, views.part)

@@ -14,9 +14,20 @@ from scipy.spatial.transform import Rotation
 from experiments.runner.vane_views import VaneViews, magnitudes, perturb, pose_error
 from experiments.studies.position import report as position_report
 from experiments.studies.position import study as position
-from experiments.studies.position import virtual_stand as stand
 from experiments.studies.position.study import Found, make_parser, move_rows, run_camera, turn_rows
-from experiments.studies.position.virtual_stand import Block, Stand
+from experiments.studies.position.virtual_test_stand import (
+    GroundCube,
+    PlacedCube,
+    VirtualTestStand,
+    calibration_errors,
+    calibrations,
+    frame_bias,
+    place_cubes,
+    pose_bias,
+    shifts_mm,
+    stage_moves,
+    stage_turns,
+)
 from vanejax.cad.surface import Surface
 from vanejax.errors import InputError
 from vanejax.localization.fine_registration import refine
@@ -37,24 +48,28 @@ KIND = dataclasses.replace(
 )
 
 
-def build(sensor: Sensor = KIND, seed: int = 0) -> Stand:
-    return Stand.built(VIEWS.part, sensor, VIEWS.viewpoints.view(VIEW), np.random.default_rng(seed))
-
-
-def known(one: Stand) -> Calibration:
-    return Calibration(
-        one.machine_from_camera, np.zeros((6, 6)), np.zeros(3), np.zeros(8), np.zeros(8), 1.0
+def build(sensor: Sensor = KIND, seed: int = 0) -> VirtualTestStand:
+    return VirtualTestStand.build(
+        VIEWS.part, sensor, VIEWS.viewpoints.view(VIEW), np.random.default_rng(seed)
     )
 
 
-def found_at(one: Stand, stages: list[RigidTransform], errors: list[np.ndarray]) -> list[Found]:
+def known(stand: VirtualTestStand) -> Calibration:
+    return Calibration(
+        stand.machine_from_camera, np.zeros((6, 6)), np.zeros(3), np.zeros(8), np.zeros(8), 1.0
+    )
+
+
+def found_at(
+    stand: VirtualTestStand, stages: list[RigidTransform], errors: list[np.ndarray]
+) -> list[Found]:
     """Registrations that are off by small motions [6] in the part's frame."""
     found = []
     for stage, e in zip(stages, errors, strict=True):
         turn = Rotation.from_rotvec(e[:3]).as_matrix()
-        center = one.part.center
+        center = stand.part.center
         off = RigidTransform(turn, center - turn @ center + e[3:])
-        truth = one.truth(stage)
+        truth = stand.truth(stage)
         found.append(
             Found(off @ truth, truth, 1e-10 * np.eye(6), np.zeros((6, 10)), "accepted", 1.0)
         )
@@ -62,41 +77,41 @@ def found_at(one: Stand, stages: list[RigidTransform], errors: list[np.ndarray])
 
 
 def test_the_stage_turns_the_part_about_its_axis():
-    one = build()
-    stages = stand.turns(12)
+    stand = build()
+    stages = stage_turns(12)
     assert len(stages) == 12
-    poses = [one.truth(stage) for stage in stages]
+    poses = [stand.truth(stage) for stage in stages]
     np.testing.assert_allclose(
-        poses[0].as_matrix(), one.camera_from_part.inverse().as_matrix(), atol=1e-9
+        poses[0].as_matrix(), stand.camera_from_part.inverse().as_matrix(), atol=1e-9
     )
     for number, pose in enumerate(poses[1:6], 1):
         seen = screw_of(camera_motion(poses[0], pose))
         assert seen.angle_deg == pytest.approx(30 * number)
-        np.testing.assert_allclose(seen.axis, one.camera_from_stage.rotation[:, 2], atol=1e-9)
+        np.testing.assert_allclose(seen.axis, stand.camera_from_stage.rotation[:, 2], atol=1e-9)
         assert seen.along_mm == pytest.approx(0, abs=1e-9)
-    drawn, true = one.expected(stages[3]), one.moved(stages[3])
+    drawn, true = stand.expected(stages[3]), stand.moved(stages[3])
     off = pose_error(drawn, true, true.apply(np.zeros((1, 3)))[0])
     assert 0.05 < magnitudes(off)[0] < 5  # the drawing is a guess, and a good one
 
 
 def test_the_probe_sees_what_the_stage_does():
-    one = build()
-    (start, *_), stages = stand.moves(12), stand.moves(12)
+    stand = build()
+    (start, *_), stages = stage_moves(12), stage_moves(12)
     np.testing.assert_array_equal(start.translation, 0)
-    before = one.probed(start, np.random.default_rng(1))
+    before = stand.probed(start, np.random.default_rng(1))
     for stage in stages[1:]:
-        after = one.probed(stage, np.random.default_rng(2))
+        after = stand.probed(stage, np.random.default_rng(2))
         way = np.mean(after - before, axis=0)
         assert np.linalg.norm(way) == pytest.approx(np.linalg.norm(stage.translation), abs=0.05)
-        truth = in_machine(one.moved(stage), one.machine_from_camera).translation
+        truth = in_machine(stand.moved(stage), stand.machine_from_camera).translation
         assert np.linalg.norm(way - truth) < 0.06  # three deviations of its mean in 3-D
     for count in (1, 13):
         with pytest.raises(InputError, match="positions must be from 2 to 12"):
-            stand.moves(count)
+            stage_moves(count)
 
 
 def test_the_cube_is_as_flat_and_square_as_it_says():
-    block = Block.ground(np.random.default_rng(3))
+    block = GroundCube.ground(np.random.default_rng(3))
     surface = Surface(block.part)
     for k in range(3):
         places = np.random.default_rng(k).uniform(-55, -5, (400, 2))
@@ -117,23 +132,23 @@ def test_shifts_are_those_of_the_sensor():
     rng = np.random.default_rng(4)
     ideal = measure(scanner, Sensor(camera=KIND.camera), pose, rng).points.astype(np.float64)
     wrong = measure(scanner, KIND, pose, rng).points - ideal
-    shifts = stand.shifts_mm(KIND, ideal)
+    shifts = shifts_mm(KIND, ideal)
     assert np.abs(shifts).max() > 0.04
     # float32 at 400 mm, and the lens sees the depth after its error
     np.testing.assert_allclose(shifts, wrong, atol=3e-4)
-    apart = [stand.shifts_mm(one, ideal) for one in stand.causes(KIND)]
+    apart = [shifts_mm(sensor, ideal) for sensor in calibration_errors(KIND)]
     assert len(apart) == 10
     np.testing.assert_allclose(np.sum(apart, axis=0), shifts, atol=1e-9)
 
 
 def test_what_the_camera_does_to_a_pose_is_what_happens():
-    one = build()
-    still = stand.turns(1)[0]
-    scan = one.scan(still, np.random.default_rng(5))
-    truth = one.truth(still)
-    fine = refine(one.model, scan.points, truth).part_from_camera
-    predicted = stand.pose_bias(one, scan, fine, stand.causes(KIND)).sum(axis=1)
-    actual = pose_error(fine, truth, one.part.center)
+    stand = build()
+    still = stage_turns(1)[0]
+    scan = stand.scan(still, np.random.default_rng(5))
+    truth = stand.truth(still)
+    fine = refine(stand.model, scan.points, truth).part_from_camera
+    predicted = pose_bias(stand, scan, fine, calibration_errors(KIND)).sum(axis=1)
+    actual = pose_error(fine, truth, stand.part.center)
     assert np.linalg.norm(actual[3:]) > 0.03
     # the refinement weighs noise it fits itself, and drops what it takes for outliers
     assert np.linalg.norm(predicted[3:] - actual[3:]) < 0.15 * np.linalg.norm(actual[3:])
@@ -141,16 +156,16 @@ def test_what_the_camera_does_to_a_pose_is_what_happens():
 
 
 @pytest.fixture(scope="module")
-def placed() -> tuple[Stand, list[stand.Placed]]:
-    one = build(dataclasses.replace(KIND, noise_px=0.0125))
-    return one, stand.place_cubes(one, np.random.default_rng(6))
+def placed() -> tuple[VirtualTestStand, list[PlacedCube]]:
+    stand = build(dataclasses.replace(KIND, noise_px=0.0125))
+    return stand, place_cubes(stand, np.random.default_rng(6))
 
 
 def test_the_cube_joins_camera_and_machine(placed):
-    one, places = placed
-    for found in stand.calibrations(places):
+    stand, places = placed
+    for found in calibrations(places):
         rotation_deg, translation_mm = magnitudes(
-            pose_error(found.machine_from_camera, one.machine_from_camera, found.center)
+            pose_error(found.machine_from_camera, stand.machine_from_camera, found.center)
         )
         assert rotation_deg < 0.05
         assert translation_mm < 0.15
@@ -158,24 +173,30 @@ def test_the_cube_joins_camera_and_machine(placed):
 
 
 def test_what_the_camera_does_to_the_frame_is_what_happens(placed):
-    one, places = placed
-    joint = stand.calibrations(places)[0]
-    predicted = stand.frame_bias(places, joint, stand.causes(KIND)).sum(axis=1)
-    actual = pose_error(joint.machine_from_camera, one.machine_from_camera, joint.center)
+    stand, places = placed
+    joint = calibrations(places)[0]
+    predicted = frame_bias(places, joint, calibration_errors(KIND)).sum(axis=1)
+    actual = pose_error(joint.machine_from_camera, stand.machine_from_camera, joint.center)
     assert np.linalg.norm(predicted[3:]) > 0.02
     # what is left is noise, of probe and scan
     assert np.linalg.norm(actual[3:] - predicted[3:]) < 0.6 * np.linalg.norm(actual[3:])
 
 
 def test_perfect_registrations_have_no_error():
-    one = build()
+    stand = build()
     none = [np.zeros(6)] * 12
-    turned = turn_rows(one, stand.turns(12), found_at(one, stand.turns(12), none))
+    turned = turn_rows(stand, stage_turns(12), found_at(stand, stage_turns(12), none))
     assert max(abs(row["error_deg"]) for row in turned["rows"]) < 1e-9
     assert turned["axis_error_deg"] < 1e-6
-    stages = stand.moves(12)
+    stages = stage_moves(12)
     rows = move_rows(
-        one, stages, found_at(one, stages, none), known(one), np.zeros((6, 10)), seed=0, salt=0
+        stand,
+        stages,
+        found_at(stand, stages, none),
+        known(stand),
+        np.zeros((6, 10)),
+        seed=0,
+        salt=0,
     )
     for row in rows:
         assert row["against_truth_mm"] < 1e-9
@@ -184,29 +205,29 @@ def test_perfect_registrations_have_no_error():
 
 
 def test_errors_are_told_where_they_are():
-    one = build()
-    stages, turn = stand.turns(12), np.radians(0.1)
-    axis_part = one.camera_from_part.inverse().rotation @ one.camera_from_stage.rotation[:, 2]
+    stand = build()
+    stages, turn = stage_turns(12), np.radians(0.1)
+    axis_part = stand.camera_from_part.inverse().rotation @ stand.camera_from_stage.rotation[:, 2]
     errors = [np.zeros(6)] * 12
     errors[4] = np.concatenate([turn * axis_part, np.zeros(3)])
-    rows = turn_rows(one, stages, found_at(one, stages, errors))["rows"]
+    rows = turn_rows(stand, stages, found_at(stand, stages, errors))["rows"]
     # the pose's error of the part seen from the camera is the opposite of the camera's of the part
     assert rows[3]["error_deg"] == pytest.approx(-0.1, abs=1e-4)
     assert rows[3]["whole_deg"] == pytest.approx(0.1, abs=1e-4)
     assert abs(rows[4]["error_deg"]) < 1e-4
     assert rows[3]["single"]["rotation_deg"] == pytest.approx(0.1)
 
-    stages = stand.moves(12)
+    stages = stage_moves(12)
     errors = [np.zeros(6)] * 12
     errors[2] = np.array([turn, 0, 0, 0.3, 0, 0])
-    found = found_at(one, stages, errors)
-    rows = move_rows(one, stages, found, known(one), np.zeros((6, 10)), seed=0, salt=0)
+    found = found_at(stand, stages, errors)
+    rows = move_rows(stand, stages, found, known(stand), np.zeros((6, 10)), seed=0, salt=0)
     assert rows[1]["against_truth_mm"] == pytest.approx(0.3, abs=1e-3)
     assert rows[1]["known_frame_mm"] == pytest.approx(0.3, abs=1e-3)
     assert rows[0]["against_truth_mm"] < 1e-9
     # 0.1 deg at 2 m: up to 3.4 mm that the part never did
     assert 0.5 < rows[1]["origin_mm"] < 4
-    motion = in_machine(camera_motion(found[0].pose, found[2].pose), one.machine_from_camera)
+    motion = in_machine(camera_motion(found[0].pose, found[2].pose), stand.machine_from_camera)
     away = np.linalg.norm(displacement(motion, np.zeros(3)) - rows[1]["true_mm"])
     assert away > 0
 

@@ -49,7 +49,7 @@ LEAST_COSINE = 0.2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Stand:
+class VirtualTestStand:
     """One camera, one part, one stage, one measuring machine.
 
     Attributes:
@@ -69,9 +69,9 @@ class Stand:
     machine_from_camera: RigidTransform
 
     @classmethod
-    def built(
+    def build(
         cls, part: Part, sensor: Sensor, camera_from_part: RigidTransform, rng: np.random.Generator
-    ) -> Stand:
+    ) -> VirtualTestStand:
         """A stage about the part as ``camera_from_part`` has it, and a machine somewhere.
 
         The part's z is along the R axis but for the tolerances of the mounting.
@@ -121,7 +121,7 @@ class Stand:
         return dents + PROBE_MM * rng.standard_normal(dents.shape)
 
 
-def turns(positions: int) -> list[RigidTransform]:
+def stage_turns(positions: int) -> list[RigidTransform]:
     """Motions of the stage about its R axis, from the initial position on round the full turn."""
     angles = 2 * np.pi * np.arange(positions) / positions
     return [
@@ -129,7 +129,7 @@ def turns(positions: int) -> list[RigidTransform]:
     ]
 
 
-def moves(positions: int) -> list[RigidTransform]:
+def stage_moves(positions: int) -> list[RigidTransform]:
     """Motions of the stage along X, Y, Z: one axis at a time, then all; the first is none.
 
     Raises:
@@ -145,7 +145,7 @@ def moves(positions: int) -> list[RigidTransform]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Block:
+class GroundCube:
     """A calibration cube as it was ground: corner at the origin, material at x, y, z < 0.
 
     Attributes:
@@ -157,7 +157,7 @@ class Block:
     lean: np.ndarray
 
     @classmethod
-    def ground(cls, rng: np.random.Generator) -> Block:
+    def ground(cls, rng: np.random.Generator) -> GroundCube:
         """Faces within their flatness, square within theirs."""
         waves = np.stack(
             [
@@ -203,7 +203,7 @@ def _height(waves: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedCube:
     """One placement of the cube, as both instruments have it.
 
     Attributes:
@@ -225,18 +225,20 @@ class Placed:
         return cube_of(self.scanned)
 
 
-def place_cubes(stand: Stand, rng: np.random.Generator) -> list[Placed]:
+def place_cubes(stand: VirtualTestStand, rng: np.random.Generator) -> list[PlacedCube]:
     """The cube at eight places before the camera, scanned and touched.
 
     A placement that hides a face from the camera or the projector is given up for another, as one
     would at the stand.
     """
-    block = Block.ground(rng)
+    block = GroundCube.ground(rng)
     scanner = Scanner(block.part)
     return [_placed(stand, block, scanner, rng) for _ in range(PLACEMENTS)]
 
 
-def _placed(stand: Stand, block: Block, scanner: Scanner, rng: np.random.Generator) -> Placed:
+def _placed(
+    stand: VirtualTestStand, block: GroundCube, scanner: Scanner, rng: np.random.Generator
+) -> PlacedCube:
     for _ in range(TRIES):
         camera_from_cube = _corner_up(rng)
         points = measure(scanner, stand.sensor, camera_from_cube, rng).points.astype(np.float64)
@@ -252,7 +254,7 @@ def _placed(stand: Stand, block: Block, scanner: Scanner, rng: np.random.Generat
             places = places + rng.uniform(-3, 3, places.shape)
             exact = machine_from_cube.apply(block.on_face(k, places))
             touched.append(exact + PROBE_MM * rng.standard_normal(exact.shape))
-        return Placed([points[label == k] for k in range(3)], touched)
+        return PlacedCube([points[label == k] for k in range(3)], touched)
     raise InputError(f"no placement of {TRIES} showed three faces of the cube to the camera")
 
 
@@ -265,34 +267,33 @@ def _corner_up(rng: np.random.Generator) -> RigidTransform:
     return RigidTransform((tilt * spin * up).as_matrix(), corner)
 
 
-def calibrations(placed: list[Placed]) -> tuple[Calibration, Calibration]:
+def calibrations(placed: list[PlacedCube]) -> tuple[Calibration, Calibration]:
     """By all planes at once, and by the paper's mean."""
-    seen = [one.scanned_cube for one in placed]
-    touched = [one.touched_cube for one in placed]
+    seen = [cube.scanned_cube for cube in placed]
+    touched = [cube.touched_cube for cube in placed]
     return calibrate(seen, touched), averaged(seen, touched)
 
 
 # What the camera's own calibration does.
 
 
-def causes(kind: Sensor) -> list[Sensor]:
+def calibration_errors(kind: Sensor) -> list[Sensor]:
     """A kind of camera with one error of its calibration each, of one standard deviation.
 
     Those that `Sensor.sample` draws.
     """
-    bare = dataclasses.replace(kind, lens=None, trueness=None)
-    found = []
+    exact = dataclasses.replace(kind, lens=None, trueness=None)
+    errors: list[dict[str, Lens | Trueness]] = []
     if kind.lens is not None:
         for name in ("k1", "k2", "p1", "p2", "focal_error"):
-            lens = Lens(**{name: getattr(kind.lens, name)})
-            found.append(dataclasses.replace(bare, lens=lens))
+            errors.append({"lens": Lens(**{name: getattr(kind.lens, name)})})
         for center in np.diag(kind.lens.center_error_px):
-            found.append(dataclasses.replace(bare, lens=Lens(center_error_px=tuple(center))))
+            errors.append({"lens": Lens(center_error_px=tuple(center))})
     if kind.trueness is not None:
-        found.append(dataclasses.replace(bare, trueness=Trueness(scale=kind.trueness.scale)))
+        errors.append({"trueness": Trueness(scale=kind.trueness.scale)})
         for bend in np.diag(kind.trueness.bend_mm):
-            found.append(dataclasses.replace(bare, trueness=Trueness(bend_mm=tuple(bend))))
-    return found
+            errors.append({"trueness": Trueness(bend_mm=tuple(bend))})
+    return [dataclasses.replace(exact, **error) for error in errors]
 
 
 def shifts_mm(sensor: Sensor, points: np.ndarray) -> np.ndarray:
@@ -310,7 +311,7 @@ def shifts_mm(sensor: Sensor, points: np.ndarray) -> np.ndarray:
 
 
 def pose_bias(
-    stand: Stand, scan: MeasuredScan, pose: RigidTransform, errors: list[Sensor]
+    stand: VirtualTestStand, scan: MeasuredScan, pose: RigidTransform, errors: list[Sensor]
 ) -> np.ndarray:
     """[6, K]: what each of K errors of calibration does to a registered pose part_from_camera.
 
@@ -319,29 +320,32 @@ def pose_bias(
     rng = np.random.default_rng(0)
     points = scan.points[rng.permutation(len(scan.points))[:BIAS_POINTS]]
     batch = RigidTransform(pose.rotation[None], pose.translation[None])
-    now = stand.model.residuals(batch, points, precision="samples")
-    on = now.hit[0] & (np.abs(now.deviation_mm[0]) < FAR_MM) & (now.cosine[0] > LEAST_COSINE)
-    columns = now.jacobian[0][on] / now.cosine[0][on, None]
-    normals = now.jacobian[0][on, 3:] @ pose.rotation
+    residuals = stand.model.residuals(batch, points, precision="samples")
+    on = (
+        residuals.hit[0]
+        & (np.abs(residuals.deviation_mm[0]) < FAR_MM)
+        & (residuals.cosine[0] > LEAST_COSINE)
+    )
+    columns = residuals.jacobian[0][on] / residuals.cosine[0][on, None]
+    normals = residuals.jacobian[0][on, 3:] @ pose.rotation
     moved = [np.einsum("ni,ni->n", normals, shifts_mm(error, points[on])) for error in errors]
-    along = np.stack(moved, axis=1) / now.cosine[0][on, None]
+    along = np.stack(moved, axis=1) / residuals.cosine[0][on, None]
     return np.linalg.solve(columns.T @ columns, columns.T @ along)
 
 
-def frame_bias(placed: list[Placed], found: Calibration, errors: list[Sensor]) -> np.ndarray:
+def frame_bias(placed: list[PlacedCube], found: Calibration, errors: list[Sensor]) -> np.ndarray:
     """[6, K]: what the same errors do to machine_from_camera, about ``found.center``."""
-    touched = [one.touched_cube for one in placed]
-    thin = [
-        Placed([some[:: max(1, len(some) // 500)] for some in one.scanned], one.touched)
-        for one in placed
+    touched = [cube.touched_cube for cube in placed]
+    scanned = [
+        [points[:: max(1, len(points) // 500)] for points in cube.scanned] for cube in placed
     ]
-    start = calibrate([one.scanned_cube for one in thin], touched).machine_from_camera
+
+    def machine_from_camera(faces: list[list[np.ndarray]]) -> RigidTransform:
+        return calibrate([cube_of(points) for points in faces], touched).machine_from_camera
+
+    start = machine_from_camera(scanned)
     columns = []
     for error in errors:
-        wrong = [
-            Placed([some + shifts_mm(error, some) for some in one.scanned], one.touched)
-            for one in thin
-        ]
-        other = calibrate([one.scanned_cube for one in wrong], touched).machine_from_camera
-        columns.append(pose_error(other, start, found.center))
+        wrong = [[points + shifts_mm(error, points) for points in faces] for faces in scanned]
+        columns.append(pose_error(machine_from_camera(wrong), start, found.center))
     return np.stack(columns, axis=1)
