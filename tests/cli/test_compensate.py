@@ -225,6 +225,7 @@ def fenced(language: str) -> list[str]:
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
 
 
+@pytest.mark.slow
 def test_every_command_of_the_page_gives_what_it_shows(tmp_path: Path, monkeypatch, capsys) -> None:
     """In the order of the page; words to the letter, numbers to 0.002.
 

@@ -38,6 +38,7 @@ def box() -> Part:
     return part_from_mesh(mesh.vertices, mesh.faces, name="box")
 
 
+@pytest.mark.slow
 def test_a_displaced_vane_is_hit_and_without_compensation_missed() -> None:
     """The part lies elsewhere than the program presumes; a scan finds it; the path is on it."""
     part = guide_vane()

@@ -178,32 +178,6 @@ def cube_of(
     return Cube(tuple(outward))
 
 
-def find_cube(
-    points: np.ndarray,
-    *,
-    side_mm: float = SIDE_MM,
-    noise_mm: float = 0.0,
-    form_mm: float = FORM_MM,
-    most_askew_deg: float = MOST_ASKEW_DEG,
-    reach_mm: float = REACH_MM,
-    seed: int = 0,
-) -> Cube:
-    """The cube in a scan of it alone that shows three of its faces.
-
-    See `cube_faces` for how the points are told apart, `cube_of` for the rest.
-
-    Raises:
-      InputError: no three faces, or not square.
-    """
-    labels = cube_faces(points, side_mm=side_mm, reach_mm=reach_mm, seed=seed)
-    return cube_of(
-        [np.asarray(points, np.float64)[labels == k] for k in range(3)],
-        noise_mm=noise_mm,
-        form_mm=form_mm,
-        most_askew_deg=most_askew_deg,
-    )
-
-
 def cube_faces(
     points: np.ndarray, *, side_mm: float = SIDE_MM, reach_mm: float = REACH_MM, seed: int = 0
 ) -> np.ndarray:

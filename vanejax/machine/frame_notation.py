@@ -1,9 +1,10 @@
-"""Frames in the words of controllers: KUKA, ISO G-code, Heidenhain, Siemens, and plain matrices.
+"""Frames in the notation of controllers: KUKA, ISO G-code, Heidenhain, Siemens, plain matrices.
 
 Every notation is a function that writes and one that reads again, and names its convention and
 source. What is written is rounded to `DECIMALS_MM` and `DECIMALS_DEG`;
-`vanejax.machine.controllers.rounding_error_mm` says what that moves. Millimetres and degrees; host
-numpy only.
+`vanejax.machine.controllers.rounding_error_mm` gives the displacement by that. A reader raises
+`InputError` where a component is missing, repeated, unknown or no number. Millimetres and degrees;
+host numpy only.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ from vanejax.rigid import RigidTransform
 DECIMALS_MM = 4
 DECIMALS_DEG = 5
 DECIMALS_MATRIX = 9  # of a rotation's entries, which are read as the nearest rotation
-WORK_OFFSETS = range(1, 7)  # G10 L2 P1 to P6 are G54 to G59
+WORK_OFFSETS = {str(53 + p): p for p in range(1, 7)}  # G10 L2 P1 to P6 are G54 to G59
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)"
 
 
 @dataclasses.dataclass(frozen=True)
 class Notation:
-    """One way to say a frame.
+    """A notation of frames.
 
     Attributes:
       title: whose it is.
@@ -44,59 +45,35 @@ class Notation:
     read: Callable[[str], RigidTransform]
 
 
-# a 4x4 matrix
-
-
 def write_matrix(machine_from_part: RigidTransform) -> str:
     """Four rows of four numbers: [x_machine, 1] = M [x_part, 1], mm."""
-    rows = np.asarray(machine_from_part.as_matrix(), np.float64)
-    decimals = [DECIMALS_MATRIX] * 3 + [DECIMALS_MM]
+    places = [DECIMALS_MATRIX] * 3 + [DECIMALS_MM]
     return "\n".join(
-        " ".join(
-            f"{_fixed(value, places):>14}" for value, places in zip(row, decimals, strict=True)
-        )
-        for row in rows
+        " ".join(f"{_fixed(v, n):>14}" for v, n in zip(row, places, strict=True))
+        for row in machine_from_part.as_matrix()
     )
 
 
 def read_matrix(text: str) -> RigidTransform:
-    """The frame that 16 numbers are, row by row.
-
-    Raises:
-      InputError: other than 16 numbers, or no rigid motion.
-    """
+    """The frame of 16 numbers, row by row."""
     return parse_transform(text, where="the matrix", target="machine", source="part")
-
-
-# KUKA
 
 
 def write_kuka(machine_from_part: RigidTransform) -> str:
     """KUKA's FRAME {X, Y, Z, A, B, C}; see `vanejax.machine.pose_file.kuka_frame`."""
     frame = kuka_frame(machine_from_part)
-    words = [f"{name} {_fixed(value, _places(name))}" for name, value in frame.items()]
-    return "{" + ",".join(words) + "}"
+    return "{" + ",".join(f"{name} {_fixed(v, _places(name))}" for name, v in frame.items()) + "}"
 
 
 def read_kuka(text: str) -> RigidTransform:
-    """The frame of ``{X 1, Y 2, Z 3, A 10, B 20, C 30}``; a name and = may stand before it.
-
-    Raises:
-      InputError: no braces, or a component that is missing, doubled, unknown or no number.
-    """
+    """The frame of ``{X 1, Y 2, Z 3, A 10, B 20, C 30}``; a name and = may stand before it."""
     match = re.search(r"\{\s*(?:FRAME\s*:)?([^{}]*)\}", text, re.IGNORECASE)
     if not match:
         raise InputError("the KUKA frame has no {X ..., Y ..., Z ..., A ..., B ..., C ...}")
-    words = []
-    for item in match[1].split(","):
-        name, *value = item.split() or [""]
-        words.append((name.upper(), " ".join(value)))
-    values = _all_of(words, "XYZABC", "the KUKA frame")
-    rotation = _rotation("ZYX", values["A"], values["B"], values["C"])
-    return RigidTransform(rotation, _xyz(values))
-
-
-# ISO G-code
+    items = [re.split(r"\s+", item.strip() + " ", maxsplit=1) for item in match[1].split(",")]
+    words = [(name.upper(), value.strip()) for name, value in items]
+    values = _values(words, "XYZABC", "the KUKA frame")
+    return _frame(values, "ZYX", [values[name] for name in "ABC"])
 
 
 def write_iso(machine_from_part: RigidTransform, *, work_offset: int = 1) -> str:
@@ -104,14 +81,14 @@ def write_iso(machine_from_part: RigidTransform, *, work_offset: int = 1) -> str
 
     G10 L2 P1 sets G54: the part's origin in the machine. G68.2 X Y Z I J K gives a feature
     coordinate system upon the active offset, here with the same origin, turned by Euler angles:
-    I about Z, J about the X so turned, K about the Z turned twice (Fanuc; post
-    processors call it EULER_ZXZ_R).
+    I about Z, J about the turned X, K about the Z turned twice (Fanuc; post processors call it
+    EULER_ZXZ_R).
 
     Args:
       machine_from_part: the work frame.
       work_offset: P of G10 L2, 1 to 6: G54 to G59.
     """
-    if work_offset not in WORK_OFFSETS:
+    if work_offset not in WORK_OFFSETS.values():
         raise InputError(f"work offset {work_offset}: should be 1 to 6, for G54 to G59")
     x, y, z = (_fixed(v, DECIMALS_MM) for v in machine_from_part.translation)
     i, j, k = (_fixed(v, DECIMALS_DEG) for v in euler_deg(machine_from_part.rotation, "ZXZ"))
@@ -126,59 +103,47 @@ def read_iso(text: str) -> RigidTransform:
     """The frame of a work offset and, if there is one, of the tilted working plane upon it.
 
     ``G10 L2 P1 X Y Z`` or the values alone, ``G54 X Y Z``; then ``G68.2 X Y Z I J K``, where what
-    is left out is 0. Comments in ( ) or after ; and block numbers are passed over.
-
-    Raises:
-      InputError: no offset or two, a word or a code that is not one of these, inches.
+    is left out is 0. Comments in ( ) or after ; and block numbers are skipped.
     """
-    offset: np.ndarray | None = None
-    number: int | None = None
-    selected: int | None = None
-    tilted: RigidTransform | None = None
+    offset = tilted = number = selected = None
     for line in text.splitlines():
         words = _iso_words(line)
+        block = f"the ISO block {line.strip()!r}"
         codes = [value for letter, value in words if letter == "G"]
         others = [(letter, value) for letter, value in words if letter not in "GN"]
-        unknown = [
-            c for c in codes if c not in ("90", "21", "10", "68.2", *map(str, range(54, 60)))
-        ]
+        unknown = [code for code in codes if code not in ("90", "21", "10", "68.2", *WORK_OFFSETS)]
         if unknown:
             raise InputError(
-                f"the ISO block {line.strip()!r} has G{unknown[0]}; a work frame is G10 L2 P1 (or "
-                "G54) with X, Y, Z in mm and absolute, and G68.2"
+                f"{block} has G{unknown[0]}; a work frame is G10 L2 P1 (or G54) with X, Y, Z in mm "
+                "and absolute, and G68.2"
             )
-        selected = next((int(c) - 53 for c in codes if 54 <= float(c) < 60), selected)
-        if "10" in codes or ("68.2" not in codes and others):
+        chosen = [WORK_OFFSETS[code] for code in codes if code in WORK_OFFSETS]
+        selected = chosen[0] if chosen else selected
+        if "68.2" in codes and "10" not in codes:
+            if tilted is not None:
+                raise InputError(f"{block} is a second G68.2")
+            values = _values(others, "XYZIJK", "G68.2 (with Euler angles, without P)", some=True)
+            tilted = _frame(values, "ZXZ", [values[name] for name in "IJK"])
+        elif others or "10" in codes:
             if offset is not None:
-                raise InputError(f"the ISO block {line.strip()!r} is a second work offset")
+                raise InputError(f"{block} is a second work offset")
             if tilted is not None:
                 raise InputError("G68.2 stands before the work offset that it is upon")
             if "10" in codes:
-                values = _all_of(others, "LPXYZ", "G10 L2")
-                number = int(values["P"])
-                if values["L"] != 2 or values["P"] not in WORK_OFFSETS:
+                values = _values(others, "LPXYZ", "G10 L2")
+                number = values["P"]
+                if values["L"] != 2 or number not in WORK_OFFSETS.values():
                     raise InputError(f"{line.strip()!r}: should be G10 L2 P1 to P6, for G54 to G59")
-            elif any(54 <= float(c) < 60 for c in codes):
-                values = _all_of(others, "XYZ", f"G{53 + (selected or 1)}")
-                number = selected
+            elif chosen:
+                values, number = _values(others, "XYZ", f"G{53 + selected}"), selected
             else:
-                raise InputError(f"the ISO block {line.strip()!r} has coordinates, but no G10 L2")
-            offset = _xyz(values)
-        elif "68.2" in codes:
-            if tilted is not None:
-                raise InputError(f"the ISO block {line.strip()!r} is a second G68.2")
-            values = _some_of(others, "XYZIJK", "G68.2 (with Euler angles, without P)")
-            rotation = _rotation("ZXZ", values["I"], values["J"], values["K"])
-            tilted = RigidTransform(rotation, _xyz(values))
+                raise InputError(f"{block} has coordinates, but no G10 L2")
+            offset = _frame(values)
     if offset is None:
         raise InputError("there is no work offset; give G10 L2 P1 X Y Z (or G54 X Y Z) in mm")
-    if None not in (number, selected) and number != selected:
-        raise InputError(f"sets G{53 + number} but works in G{53 + selected}; use the same")
-    machine_from_work = RigidTransform(np.eye(3), offset)
-    return machine_from_work if tilted is None else machine_from_work @ tilted
-
-
-# Heidenhain
+    if selected not in (None, number):
+        raise InputError(f"sets G{53 + int(number)} but works in G{53 + selected}; use the same")
+    return offset if tilted is None else offset @ tilted
 
 
 def write_heidenhain(machine_from_part: RigidTransform) -> str:
@@ -187,10 +152,9 @@ def write_heidenhain(machine_from_part: RigidTransform) -> str:
     SPA, SPB, SPC turn about the fixed X, then Y, then Z, which is the same as C, B, A about the
     turned axes (TNC 620, conversational programming, 10/2017, p. 540). STAY moves no axis.
     """
-    x, y, z = (_fixed(v, DECIMALS_MM, sign=True) for v in machine_from_part.translation)
-    a, b, c = (
-        _fixed(v, DECIMALS_DEG, sign=True) for v in euler_deg(machine_from_part.rotation, "xyz")
-    )
+    x, y, z = (_fixed(v, DECIMALS_MM, sign="+") for v in machine_from_part.translation)
+    angles = euler_deg(machine_from_part.rotation, "xyz")
+    a, b, c = (_fixed(v, DECIMALS_DEG, sign="+") for v in angles)
     return (
         "CYCL DEF 7.0 DATUM SHIFT\n"
         f"CYCL DEF 7.1 X{x}\nCYCL DEF 7.2 Y{y}\nCYCL DEF 7.3 Z{z}\n"
@@ -199,27 +163,18 @@ def write_heidenhain(machine_from_part: RigidTransform) -> str:
 
 
 def read_heidenhain(text: str) -> RigidTransform:
-    """The frame of a datum shift and, if there is one, of PLANE SPATIAL after it.
-
-    Raises:
-      InputError: an axis of the shift or an angle is missing or doubled.
-    """
+    """The frame of a datum shift and, if there is one, of PLANE SPATIAL after it."""
     text = re.sub(r";.*", "", text).upper()
     shifts = re.findall(rf"CYCL DEF 7\.[1-9]\s+([A-Z])\s*({_NUMBER})\s*$", text, re.MULTILINE)
-    values = _all_of(shifts, "XYZ", "the datum shift (CYCL DEF 7)")
-    rotation = np.eye(3)
+    values = _values(shifts, "XYZ", "the datum shift (CYCL DEF 7)")
     planes = re.findall(r"PLANE\s+SPATIAL(.*)", text)
     if len(planes) > 1:
         raise InputError("there are two PLANE SPATIAL; a work frame has one")
-    if planes:
-        angles = _all_of(
-            re.findall(rf"SP([A-Z])\s*({_NUMBER})(?![\d.])", planes[0]), "ABC", "PLANE SPATIAL, SP"
-        )
-        rotation = _rotation("ZYX", angles["C"], angles["B"], angles["A"])
-    return RigidTransform(rotation, _xyz(values))
-
-
-# Siemens
+    if not planes:
+        return _frame(values)
+    words = re.findall(rf"SP([A-Z])\s*({_NUMBER})(?![\d.])", planes[0])
+    angles = _values(words, "ABC", "PLANE SPATIAL, SP")
+    return _frame(values, "ZYX", [angles[name] for name in "CBA"])
 
 
 def write_siemens(machine_from_part: RigidTransform) -> str:
@@ -228,20 +183,14 @@ def write_siemens(machine_from_part: RigidTransform) -> str:
     CTRANS, then CROT with RPY angles: Z, then the turned Y, then the X turned twice (MD10600 = 1,
     the default; SINUMERIK 840D sl, Basic Functions, K2, 11/2006, p. 56).
     """
-    frame = kuka_frame(machine_from_part)
-    shift = ",".join(f"{n},{_fixed(frame[n], DECIMALS_MM)}" for n in "XYZ")
-    turn = ",".join(
-        f"{axis},{_fixed(frame[n], DECIMALS_DEG)}" for axis, n in zip("XYZ", "CBA", strict=True)
-    )
+    frame = {name: _fixed(v, _places(name)) for name, v in kuka_frame(machine_from_part).items()}
+    shift = ",".join(f"{name},{frame[name]}" for name in "XYZ")
+    turn = ",".join(f"{axis},{frame[name]}" for axis, name in zip("XYZ", "CBA", strict=True))
     return f"$P_UIFR[1]=CTRANS({shift}):CROT({turn})"
 
 
 def read_siemens(text: str) -> RigidTransform:
-    """The frame of ``CTRANS(X,1,Y,2,Z,3):CROT(X,10,Y,20,Z,30)``; CROT may be left out.
-
-    Raises:
-      InputError: no CTRANS, another function in the chain, or a component missing or doubled.
-    """
+    """The frame of ``CTRANS(X,1,Y,2,Z,3):CROT(X,10,Y,20,Z,30)``; CROT may be left out."""
     _, _, chain = re.sub(r";.*", "", text).upper().rpartition("=")
     calls = re.findall(r"([A-Z]+)\s*\(([^()]*)\)", chain)
     names = [name for name, _ in calls]
@@ -254,12 +203,10 @@ def read_siemens(text: str) -> RigidTransform:
         items = [item.strip() for item in inside.split(",")]
         if len(items) % 2:
             raise InputError(f"{name}({inside}) should be pairs of an axis and a number")
-        values.append(_all_of(list(zip(items[::2], items[1::2], strict=True)), "XYZ", name))
-    rotation = np.eye(3)
-    if len(values) == 2:
-        angles = values[1]
-        rotation = _rotation("ZYX", angles["Z"], angles["Y"], angles["X"])
-    return RigidTransform(rotation, _xyz(values[0]))
+        values.append(_values(list(zip(items[::2], items[1::2], strict=True)), "XYZ", name))
+    if len(values) == 1:
+        return _frame(values[0])
+    return _frame(values[0], "ZYX", [values[1][name] for name in "ZYX"])
 
 
 NOTATIONS: Mapping[str, Notation] = {
@@ -291,37 +238,35 @@ NOTATIONS: Mapping[str, Notation] = {
         read_siemens,
     ),
 }
-_SIGNS = (
-    (r"CTRANS", "siemens"),
-    (r"CYCL\s+DEF|PLANE\s+SPATIAL", "heidenhain"),
-    (r"\{\s*(FRAME\s*:)?\s*[XYZABC]\b", "kuka"),
-    (r"^[\sN\d]*G\d", "iso"),
-)
+_PATTERNS = {
+    "siemens": r"CTRANS",
+    "heidenhain": r"CYCL\s+DEF|PLANE\s+SPATIAL",
+    "kuka": r"\{\s*(FRAME\s*:)?\s*[XYZABC]\b",
+    "iso": r"^[\sN\d]*G\d",
+}
 
 
 def notation_of(text: str) -> str:
     """The key in `NOTATIONS` of a text; what is no other is a matrix."""
     plain = re.sub(r"\([^()]*\)", "", text) if "CTRANS" not in text.upper() else text
-    for pattern, name in _SIGNS:
+    for name, pattern in _PATTERNS.items():
         if re.search(pattern, plain, re.IGNORECASE | re.MULTILINE):
             return name
     return "matrix"
 
 
-def _rotation(order: str, *angles_deg: float) -> np.ndarray:
-    """Rotation [3, 3] of three angles, in an order as scipy names it."""
+def _frame(
+    values: Mapping[str, float], order: str = "ZYX", angles_deg: Sequence[float] = (0, 0, 0)
+) -> RigidTransform:
+    """The frame at X, Y, Z of ``values``, with three angles in an order as scipy names it."""
     # a whole number of turns less: degrees are exact, radians are not
-    return Rotation.from_euler(order, np.remainder(angles_deg, 360.0), degrees=True).as_matrix()
+    rotation = Rotation.from_euler(order, np.remainder(angles_deg, 360.0), degrees=True)
+    return RigidTransform(rotation.as_matrix(), np.array([values[name] for name in "XYZ"]))
 
 
-def _xyz(values: Mapping[str, float]) -> np.ndarray:
-    return np.array([values["X"], values["Y"], values["Z"]])
-
-
-def _fixed(value: float, places: int, *, sign: bool = False) -> str:
+def _fixed(value: float, places: int, *, sign: str = "") -> str:
     """A number with so many decimals, never -0."""
-    rounded = round(float(value), places) + 0.0
-    return f"{rounded:{'+' if sign else ''}.{places}f}"
+    return f"{round(float(value), places) + 0.0:{sign}.{places}f}"
 
 
 def _places(name: str) -> int:
@@ -340,29 +285,23 @@ def _iso_words(line: str) -> list[tuple[str, str]]:
     return [(a, re.sub(r"^0+(?=\d)", "", b) if a == "G" else b) for a, b in words]
 
 
-def _all_of(words: Sequence[tuple[str, str]], names: str, where: str) -> dict[str, float]:
-    """Every one of the one-letter names once, and no other."""
-    values = _some_of(words, names, where)
-    missing = [name for name in names if name not in dict(words)]
-    if missing:
-        raise InputError(f"{where} has no {', '.join(missing)}; it needs {', '.join(names)}")
-    return values
-
-
-def _some_of(words: Sequence[tuple[str, str]], names: str, where: str) -> dict[str, float]:
-    """Some of the names, each at most once, and no other; what is left out is 0."""
-    values = dict.fromkeys(names, 0.0)
-    seen: set[str] = set()
+def _values(
+    words: Sequence[tuple[str, str]], names: str, where: str, *, some: bool = False
+) -> dict[str, float]:
+    """Every one of the one-letter names once, and no other; with ``some``, the rest is 0."""
+    values: dict[str, float] = {}
     for name, text in words:
         if not name or name not in names:
             raise InputError(f"{where} has {name or 'nothing'!r}; it takes {', '.join(names)}")
-        if name in seen:
+        if name in values:
             raise InputError(f"{where} has {name} twice")
-        seen.add(name)
         try:
             values[name] = float(text.replace("_", "?"))  # 1_0 is a number to Python alone
         except ValueError:
             raise InputError(f"{where}: {name} is {text!r}, which is no number") from None
         if not np.isfinite(values[name]):
             raise InputError(f"{where}: {name} is {text}, which is not finite")
-    return values
+    missing = [name for name in names if name not in values]
+    if missing and not some:
+        raise InputError(f"{where} has no {', '.join(missing)}; it needs {', '.join(names)}")
+    return dict.fromkeys(missing, 0.0) | values

@@ -57,26 +57,19 @@ MAX_BYTES = 16 << 20
 
 
 def pose_to_dict(part_from_camera: RigidTransform) -> dict[str, Any]:
-    """A pose and its inverse as plain values; `CONVENTIONS` says what each is.
-
-    Args:
-      part_from_camera: rotation [3, 3], translation [3] in mm.
-    """
-    poses = {
-        "part_from_camera": part_from_camera,
-        "camera_from_part": part_from_camera.inverse(),
-    }
-    matrices = {name: np.asarray(pose.as_matrix(), np.float64) for name, pose in poses.items()}
-    found: dict[str, Any] = {name: matrix.tolist() for name, matrix in matrices.items()}
-    for name, matrix in matrices.items():
-        rotation = matrix[:3, :3]
-        found[f"{name}_as"] = {
-            "translation_mm": matrix[:3, 3].tolist(),
-            "quaternion_wxyz": quaternion_wxyz(rotation).tolist(),
-            "euler_xyz_deg": euler_deg(rotation, "xyz").tolist(),
-            "kuka": kuka_frame(poses[name]),
+    """A pose (mm) and its inverse as plain values; `CONVENTIONS` says what each is."""
+    poses = {"part_from_camera": part_from_camera, "camera_from_part": part_from_camera.inverse()}
+    values: dict[str, Any] = {name: pose.as_matrix() for name, pose in poses.items()}
+    for name, pose in poses.items():
+        values[f"{name}_as"] = {
+            "translation_mm": pose.translation,
+            "quaternion_wxyz": Rotation.from_matrix(pose.rotation).as_quat(
+                canonical=True, scalar_first=True
+            ),
+            "euler_xyz_deg": euler_deg(pose.rotation, "xyz"),
+            "kuka": kuka_frame(pose),
         }
-    return found
+    return _plain(values)
 
 
 def kuka_frame(pose: RigidTransform) -> dict[str, float]:
@@ -88,11 +81,6 @@ def kuka_frame(pose: RigidTransform) -> dict[str, float]:
     x, y, z = np.asarray(pose.translation, np.float64).tolist()
     a, b, c = euler_deg(pose.rotation, "xyz").tolist()
     return {"X": x, "Y": y, "Z": z, "A": c, "B": b, "C": a}
-
-
-def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion [4] f64 (w, x, y, z) of a rotation [3, 3], with w >= 0."""
-    return Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
 
 
 def euler_deg(rotation: np.ndarray, order: str) -> np.ndarray:
@@ -115,17 +103,14 @@ def result_to_dict(
     seed: int | None = None,
     weights_name: str | None = None,
 ) -> dict[str, Any]:
-    """All that a registration found, but for what it says of each point, as plain values.
+    """A registration's result without its points, as values that JSON can hold.
 
     Args:
-      result: what `vanejax.register` gave.
+      result: what `vanejax.register` gave; a number in it that is not finite becomes None.
       scan_name, part_name: what was registered to what.
       part_sha256: `Part.sha256`.
       seed: of the registration.
       weights_name: the trained matcher's file.
-
-    Returns:
-      What JSON can hold; a number that is not finite is None.
     """
     alternatives = [
         pose_to_dict(other.part_from_camera)
@@ -172,18 +157,12 @@ def result_to_dict(
 
 
 def write_result(path: str | os.PathLike[str], result: PoseResult, **names: Any) -> None:
-    """Writes `result_to_dict` as JSON; the file appears complete or not at all.
-
-    Args:
-      path: the file; `read_pose` reads it again.
-      result: what `vanejax.register` gave.
-      names: the keyword arguments of `result_to_dict`.
+    """Writes `result_to_dict` (with the same arguments) as JSON, which `read_pose` reads again.
 
     Raises:
       InputError: the file cannot be written.
     """
-    values = result_to_dict(result, **names)
-    write_json(path, values, allow_nan=False)
+    write_json(path, result_to_dict(result, **names), allow_nan=False)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -224,15 +203,13 @@ def read_record(path: str | os.PathLike[str]) -> PoseRecord:
 
 
 def read_pose(path: str | os.PathLike[str]) -> RigidTransform:
-    """Reads part_from_camera, for example as a first guess.
+    """Reads part_from_camera (f64), for example as a first guess.
 
     Args:
       path: JSON that `write_result` wrote, or ``{"part_from_camera": M}``,
         ``{"camera_from_part": M}``, or M alone, with M 4x4, row-major, mm (or ``{"matrix": M}``);
-        or text with the 16 numbers of part_from_camera row by row, lines with # left out.
-
-    Returns:
-      The pose, f64, its rotation the nearest one to what the file holds.
+        or text with the 16 numbers of part_from_camera row by row, lines with # left out. The
+        rotation becomes the nearest one.
 
     Raises:
       InputError: no such file, no pose in it, or no rigid motion; names the file and the value.
@@ -305,26 +282,22 @@ def _from_json(text: str, where: str, target: str, source: str) -> RigidTransfor
         if name in values
     }
     if not poses:
-        there = ", ".join(map(repr, list(values)[:8])) or "nothing"
+        names = ", ".join(map(repr, list(values)[:8])) or "nothing"
         raise InputError(
-            f'{where}: has no "{forward}" and no "{backward}", each 4x4, row-major, '
-            f"mm; it has {there}"
+            f'{where}: has no "{forward}" and no "{backward}", each 4x4, row-major, mm; it has '
+            f"{names}"
         )
-    if len(poses) == 2:
-        _check_inverse(poses[forward], poses[backward], f'{where}: "{forward}" and "{backward}"')
-    if forward in poses:
-        return poses[forward]
-    return poses[backward].inverse()
-
-
-def _check_inverse(one: RigidTransform, other: RigidTransform, names: str) -> None:
-    """Refuses a file in which only one of the two matrices was edited."""
-    rest = one @ other
-    # rounded entries of a rotation move a point that is far away
-    limit = MATRIX_TOLERANCE * (1 + np.linalg.norm(one.translation))
-    turned = np.abs(rest.rotation - np.eye(3)).max() > MATRIX_TOLERANCE
-    if turned or np.abs(rest.translation).max() > limit:
-        raise InputError(f"{names} are not inverse to each other; keep the one that is right")
+    if len(poses) == 2:  # in a file that was edited, perhaps only one of the two was
+        rest = poses[forward] @ poses[backward]
+        # rounded entries of a rotation move a point that is far away
+        limit = MATRIX_TOLERANCE * (1 + np.linalg.norm(poses[forward].translation))
+        turned = np.abs(rest.rotation - np.eye(3)).max() > MATRIX_TOLERANCE
+        if turned or np.abs(rest.translation).max() > limit:
+            raise InputError(
+                f'{where}: "{forward}" and "{backward}" are not inverse to each other; keep the '
+                "one that is right"
+            )
+    return poses[forward] if forward in poses else poses[backward].inverse()
 
 
 def _matrix(value: Any, where: str) -> np.ndarray:

@@ -6,9 +6,8 @@ the frame of a measuring machine (eq. 13), to be compared with probed points (eq
 
 A small motion e [6] is (rotation vector in rad, translation in mm) about a centre c, applied
 afterwards: ``x -> c + exp(e[:3]) (x - c) + e[3:]``. As in
-`vanejax.localization.pose_result.Uncertainty`, it is
-the error of what is reported: the truth is that small motion after the report. All is first order
-in it. Host code, float64.
+`vanejax.localization.pose_result.Uncertainty`, it is the error of what is reported: the truth is
+that small motion after the report. All is first order in it. Host code, float64.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
 
-_STILL_RAD = 1e-9  # less is no rotation: its axis and point are rounding errors
+_STILL_RAD = 1e-9  # less is no rotation: its axis is a rounding error
 _FLIPPED = 1e-9  # of half a turn of swing: then every twist fits
 
 
@@ -30,9 +29,8 @@ def camera_motion(before: RigidTransform, after: RigidTransform) -> RigidTransfo
 
     A point of the part, at x in the camera's frame before, is at ``motion.apply(x)`` after:
     ``camera_from_part(after) @ part_from_camera(before)``. The paper's ``T = T2 T1^-1`` is the same
-    with T = camera_from_part, the motion from the model to the scan. With part_from_camera in that
-    order, ``after @ before.inverse()``, one gets the motion that the *part's* frame sees the camera
-    make: another axis, and the opposite angle.
+    with T = camera_from_part. With part_from_camera in that order it would be the motion of the
+    camera in the *part's* frame: another axis, and the opposite angle.
     """
     return after.inverse() @ before
 
@@ -53,53 +51,6 @@ def displacement(motion: RigidTransform, point: np.ndarray) -> np.ndarray:
     """
     point = np.asarray(point, np.float64)
     return motion.rotation @ point + motion.translation - point
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Screw:
-    """A motion as one turn about an axis and one slide along it (Chasles).
-
-    Attributes:
-      axis: [3] unit; of a pure translation its direction, of no motion at all z.
-      angle_deg: 0 to 180, counter-clockwise seen against the axis.
-      point: [3] mm, the point of the axis that is nearest the origin; of a pure translation 0.
-      along_mm: the slide.
-    """
-
-    axis: np.ndarray
-    angle_deg: float
-    point: np.ndarray
-    along_mm: float
-
-    @property
-    def pitch_mm(self) -> float:
-        """Slide per full turn; infinite for a pure translation."""
-        return 360 * self.along_mm / self.angle_deg if self.angle_deg else float("inf")
-
-    @property
-    def motion(self) -> RigidTransform:
-        """Inverse of `screw_of`."""
-        rotation = Rotation.from_rotvec(np.radians(self.angle_deg) * self.axis).as_matrix()
-        return RigidTransform(
-            rotation, self.point - rotation @ self.point + self.along_mm * self.axis
-        )
-
-
-def screw_of(motion: RigidTransform) -> Screw:
-    """Equivalent axis and angle of a motion, with the place of the axis and the slide along it."""
-    turn = Rotation.from_matrix(motion.rotation).as_rotvec()
-    angle = float(np.linalg.norm(turn))
-    shift = np.asarray(motion.translation, np.float64)
-    if angle < _STILL_RAD:
-        length = float(np.linalg.norm(shift))
-        axis = shift / length if length else np.array([0.0, 0.0, 1.0])
-        return Screw(axis, 0.0, np.zeros(3), length)
-    axis = turn / angle
-    along = float(axis @ shift)
-    across = shift - along * axis
-    # (I - R) p = across, solved in the plane across the axis
-    point = 0.5 * (across + np.cross(axis, across) / np.tan(angle / 2))
-    return Screw(axis, float(np.degrees(angle)), point, along)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,30 +118,14 @@ def common_axis(rotations: np.ndarray) -> np.ndarray:
       InputError: no rotation, or none that turns by more than rounding.
     """
     rotations = np.asarray(rotations, np.float64).reshape(-1, 3, 3)
-    imaginary = (
-        Rotation.from_matrix(rotations).as_quat(canonical=True)[:, :3]
-        if len(rotations)
-        else np.zeros((0, 3))
-    )
+    if not len(rotations):
+        raise InputError("no rotation to find an axis from")
+    imaginary = Rotation.from_matrix(rotations).as_quat(canonical=True)[:, :3]
     values, vectors = np.linalg.eigh(imaginary.T @ imaginary)
     if values[-1] < _STILL_RAD**2:
         raise InputError("no rotation to find an axis from: turn the part between the scans")
     axis = vectors[:, -1]
     return axis if np.sum(imaginary @ axis) >= 0 else -axis
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class ProbedMotion:
-    """The motion of a body of which some points were probed before and after.
-
-    Attributes:
-      motion: in the probe's frame.
-      rms_mm: of what is left of the K points, over their 3 K - 6 degrees of freedom; 0 if there
-        are none.
-    """
-
-    motion: RigidTransform
-    rms_mm: float
 
 
 def probe_translation(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -202,42 +137,15 @@ def probe_translation(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     Raises:
       InputError: not as many points before and after, or none.
     """
-    before, after = _pairs(before, after, least=1)
-    return np.mean(after - before, axis=0)
-
-
-def probe_motion(before: np.ndarray, after: np.ndarray) -> ProbedMotion:
-    """The rigid motion that fits probed points [K, 3] best, K at least 3 and not on one line.
-
-    Beside the translation of eq. 12 it tells whether the stage turned the part as well.
-
-    Raises:
-      InputError: points that fix no motion.
-    """
-    before, after = _pairs(before, after, least=3)
-    start, end = before.mean(axis=0), after.mean(axis=0)
-    spread = np.linalg.svd(before - start, compute_uv=False)
-    if spread[1] < 1e-6 * max(spread[0], 1e-30):
-        raise InputError("the probed points lie on one line: no rotation follows; probe others")
-    rotation = Rotation.align_vectors(after - end, before - start)[0].as_matrix()
-    motion = RigidTransform(rotation, end - rotation @ start)
-    left = after - motion.apply(before)
-    free = 3 * len(before) - 6
-    return ProbedMotion(motion, float(np.sqrt(np.sum(left**2) / free)) if free else 0.0)
-
-
-def _pairs(before: np.ndarray, after: np.ndarray, *, least: int) -> tuple[np.ndarray, np.ndarray]:
     before, after = np.asarray(before, np.float64), np.asarray(after, np.float64)
-    if before.shape != after.shape or before.ndim != 2 or before.shape[1] != 3:
+    if before.shape != after.shape or before.ndim != 2 or before.shape[1] != 3 or not len(before):
         raise InputError(
             f"probed points must be [K, 3] mm, the same before and after; got {before.shape} and "
             f"{after.shape}"
         )
-    if len(before) < least:
-        raise InputError(f"{len(before)} probed points are too few; at least {least} are needed")
     if not (np.isfinite(before).all() and np.isfinite(after).all()):
         raise InputError("probed points must be finite, in mm")
-    return before, after
+    return np.mean(after - before, axis=0)
 
 
 # Errors to first order. e about c is v + w x (x - c): two matrices carry it anywhere.

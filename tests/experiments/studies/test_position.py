@@ -33,7 +33,8 @@ from vanejax.errors import InputError
 from vanejax.localization.fine_registration import refine
 from vanejax.localization.registration import register
 from vanejax.machine.calibration import Calibration
-from vanejax.machine.positioning import camera_motion, displacement, in_machine, screw_of
+from vanejax.machine.controllers import axis_angle_deg
+from vanejax.machine.positioning import camera_motion, displacement, in_machine
 from vanejax.plotting.canvas import save_figure
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.measurement import measure
@@ -85,10 +86,11 @@ def test_the_stage_turns_the_part_about_its_axis():
         poses[0].as_matrix(), stand.camera_from_part.inverse().as_matrix(), atol=1e-9
     )
     for number, pose in enumerate(poses[1:6], 1):
-        seen = screw_of(camera_motion(poses[0], pose))
-        assert seen.angle_deg == pytest.approx(30 * number)
-        np.testing.assert_allclose(seen.axis, stand.camera_from_stage.rotation[:, 2], atol=1e-9)
-        assert seen.along_mm == pytest.approx(0, abs=1e-9)
+        seen = camera_motion(poses[0], pose)
+        axis, angle = axis_angle_deg(seen.rotation)
+        assert angle == pytest.approx(30 * number)
+        np.testing.assert_allclose(axis, stand.camera_from_stage.rotation[:, 2], atol=1e-9)
+        assert seen.translation @ axis == pytest.approx(0, abs=1e-9)
     drawn, true = stand.expected(stages[3]), stand.moved(stages[3])
     off = pose_error(drawn, true, true.apply(np.zeros((1, 3)))[0])
     assert 0.05 < magnitudes(off)[0] < 5  # the drawing is a guess, and a good one
