@@ -17,10 +17,8 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import datetime
 import hashlib
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -33,13 +31,14 @@ from experiments.runner import command_line
 from experiments.runner import study_command as study
 from experiments.runner.evaluation_report import plain
 from experiments.runner.experiment import Experiment
-from experiments.runner.machine import cores, cpu_model
-from experiments.runner.run_folder import RunFolder, git_commit, training_record, versions
-from experiments.runner.sweep import Cell, Sweep, grid, parse_seeds, parse_sweeps
+from experiments.runner.machine import report_head
+from experiments.runner.run_folder import RunFolder, training_record
+from experiments.runner.stopping import TrainingDiverged
+from experiments.runner.sweep import Cell, Sweep, check_used, grid, parse_seeds, parse_sweeps
 from experiments.runner.trained import trained
 from experiments.studies.ablation import picture as ablation_picture
 from experiments.studies.ablation.table import CELL_TESTS, over_seeds, table
-from experiments.train import Interrupted, TrainingDiverged, load_or_scan
+from experiments.train import load_or_scan
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.files import write_text
@@ -118,6 +117,7 @@ def ablate(
       Interrupted: SIGINT or SIGTERM, after the state of the cell was saved.
     """
     cells = grid(sweeps, seeds)
+    check_used(cells, config)
     shared = SharedScans(workdir)
     for cell in cells:
         settings = cell.config(config)
@@ -140,14 +140,10 @@ def ablate(
                 done.append(row)
                 write_text(workdir / "cells.jsonl", "".join(json.dumps(r) + "\n" for r in done))
             rows.append(row)
+    head = report_head(part, seed=config.seed, config=dataclasses.asdict(config))
     report = {
         "name": config.name,
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "machine": {"cpu": cpu_model(), "cores": cores()},
-        "commit": git_commit(),
-        "versions": versions(),
-        "part": {"name": part.name, "sha256": part.sha256},
-        "config": dataclasses.asdict(config),
+        **head,
         "sweeps": [dataclasses.asdict(sweep) for sweep in sweeps],
         "seeds": list(seeds),
         "points": over_seeds(rows),
@@ -176,9 +172,10 @@ def run_cell(
         network = trained(config, part, scans, folder)
     except TrainingDiverged as trouble:
         print(f"{cell.name}: training diverged: {trouble}")
-        told = training_record(folder).summary(config.training.steps) | {"ended_by": "divergence"}
+        training = training_record(folder).summary(config.training.steps)
+        training["ended_by"] = "divergence"
     else:
-        told = network.record.summary(config.training.steps)
+        training = network.record.summary(config.training.steps)
         tests["own"] = errors_under(config, scans, network.variables, progress=progress)
         same = same_test(config, base)
         tests["same"] = tests["own"]
@@ -189,15 +186,10 @@ def run_cell(
     row = {
         "cell": cell.name,
         "overrides": dict(cell.overrides),
-        "seed": cell.seed,
-        "part": {"name": part.name, "sha256": part.sha256},
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        **report_head(part, seed=cell.seed, config=dataclasses.asdict(config)),
         "device": str(jax.devices()[0].device_kind),
-        "commit": git_commit(),
-        "versions": versions(),
-        "training": {name: told[name] for name in told if name != "curve"},
+        "training": {name: training[name] for name in training if name != "curve"},
         "tests": tests,
-        "config": dataclasses.asdict(config),
     }
     return plain(row)
 
@@ -248,28 +240,13 @@ def finished(cell: Cell, part: Part, rows: Sequence[dict[str, Any]]) -> dict[str
 
 def list_cells(cells: Sequence[Cell], config: Experiment, workdir: Path) -> None:
     """Prints what would be trained, and how long at most."""
+    check_used(cells, config)
     names = {row["cell"] for row in read_cells(workdir)}
     for cell in cells:
         settings = cell.config(config).training
         most = f", {settings.budget_minutes:g} min at most" if settings.budget_minutes else ""
         told = "finished" if cell.name in names else f"{settings.steps} steps{most}"
         print(f"{cell.name}: {told}")
-
-
-def main(config: Experiment, workdir: Path, sweeps: Sequence[Sweep], seeds: Sequence[int]) -> int:
-    """Runs the ablation; the exit code."""
-    try:
-        ablate(config, sweeps, seeds, workdir)
-    except Interrupted as stop:
-        print(f"{stop}; saved in {workdir}. Run the same command to go on.", file=sys.stderr)
-        return 128 + stop.signal
-    except KeyboardInterrupt:
-        print(
-            f"interrupted; {workdir} keeps what is done. Run the same command to go on.",
-            file=sys.stderr,
-        )
-        return 130
-    return 0
 
 
 if __name__ == "__main__":
@@ -289,10 +266,10 @@ if __name__ == "__main__":
     )
     CELLS = flags.DEFINE_bool("cells", False, "list the cells and train none")
 
-    def run() -> int:
+    def run() -> None:
         """The command."""
         config = CONFIG.value
-        sweeps, seeds = parse_sweeps(SWEEPS.value), parse_seeds(SEEDS.value, config.seed)
+        sweeps, seeds = parse_sweeps(SWEEPS.value, config), parse_seeds(SEEDS.value, config.seed)
         workdir = Path(WORKDIR.value or f"runs/{config.name}-ablation")
         if MINUTES.value is not None:
             if any(sweep.field == "training.budget_minutes" for sweep in sweeps):
@@ -300,7 +277,7 @@ if __name__ == "__main__":
             config.training.budget_minutes = MINUTES.value
         if CELLS.value:
             list_cells(grid(sweeps, seeds), config, workdir)
-            return 0
-        return main(config, workdir, sweeps, seeds)
+        else:
+            ablate(config, sweeps, seeds, workdir)
 
     command_line.run(run)

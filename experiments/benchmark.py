@@ -66,12 +66,9 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
         large=settings.large,
     )
     report = study.header("times, warm", settings, bench.views.part)
-    report["machine"] |= {
-        "cpu": machine.cpu_model(),
-        "cores": machine.cores(),
-        "matmul_flops_per_second": float(np.median(machine.flops_per_second(LEAST_REPEATS))),
-    }
-    report["versions"] |= machine.peer_versions()
+    rates = machine.flops_per_second(LEAST_REPEATS)
+    report["machine"]["matmul_flops_per_second"] = float(np.median(rates))
+    report["versions"] |= machine.versions(machine.PEERS)
     figures: list[Figure | Series] = []
     for name in names:
         print(f"{name} ...", file=sys.stderr)

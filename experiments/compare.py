@@ -13,7 +13,6 @@ VANEJAX_CACHE_DIR is where compiled programs are kept (~/.cache/vanejax); off ke
 from __future__ import annotations
 
 import dataclasses
-import datetime
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,17 +24,16 @@ from absl import flags
 from experiments.runner import command_line
 from experiments.runner import study_command as study
 from experiments.runner.evaluation_report import hardest_views, summarize
-from experiments.runner.machine import cores, cpu_model, peer_versions
+from experiments.runner.machine import PACKAGES, PEERS, report_head, versions
 from experiments.runner.registrations import Results, register_views
 from experiments.runner.required_accuracy import NEED_DEG, NEED_MM, within_need
-from experiments.runner.run_folder import git_commit, versions
 from experiments.runner.trained import Trained, given_runs, trained
 from experiments.studies.comparison import pictures as comparison_pictures
 from experiments.studies.comparison.fine_step import FineStep
 from experiments.studies.comparison.methods import TABLE_1, TITLES, make_method, settings_of
 from experiments.studies.comparison.settings import NETWORKS, Comparison
 from experiments.studies.comparison.table import table
-from experiments.train import exit_code, load_or_scan
+from experiments.train import load_or_scan
 from vanejax.errors import InputError, MissingExtra
 from vanejax.files import write_text
 from vanejax.matching.metrics import summary
@@ -79,13 +77,8 @@ def compare(
     sampling, fine_step = experiment.pair_sampling(scans), FineStep(part, test)
     report: dict[str, Any] = {
         "name": config.name,
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "machine": {"cpu": cpu_model(), "cores": cores()},
-        "commit": git_commit(),
-        "versions": versions() | peer_versions(),
-        "part": {"name": part.name, "sha256": part.sha256},
-        "seed": experiment.seed,
-        "config": dataclasses.asdict(config),
+        **report_head(part, seed=experiment.seed, config=dataclasses.asdict(config)),
+        "versions": versions((*PACKAGES, *PEERS)),
         "views": len(test),
         "hardest": hardest_views(test),
         "need": {"rotation_deg": NEED_DEG, "translation_mm": NEED_MM},
@@ -166,12 +159,10 @@ def training_told(network: Trained | None) -> dict[str, Any] | None:
     }
 
 
-def main(config: Comparison, workdir: Path, methods: list[str], words: list[str]) -> int:
-    """Compares; the exit code."""
-    if methods:
-        config.methods = tuple(methods)
-    runs = given_runs(words, NETWORKS)
-    return exit_code(lambda: compare(config, workdir, runs), workdir)
+def main(config: Comparison, workdir: Path, methods: list[str], runs: list[str]) -> None:
+    """Compares the methods of the command line, or the config's where it names none."""
+    config.methods = tuple(methods) or config.methods
+    compare(config, workdir, given_runs(runs, NETWORKS))
 
 
 if __name__ == "__main__":
@@ -184,9 +175,9 @@ if __name__ == "__main__":
         "trained", [], "NAME=FOLDER: take this network from a finished run instead of training it"
     )
 
-    def run() -> int:
+    def run() -> None:
         """The command."""
         workdir = command_line.workdir(WORKDIR, CONFIG)
-        return main(CONFIG.value, workdir, CHOICE.value, RUNS.value)
+        main(CONFIG.value, workdir, CHOICE.value, RUNS.value)
 
     command_line.run(run, tree=Comparison)

@@ -13,7 +13,6 @@ VANEJAX_CACHE_DIR is where compiled programs are kept (~/.cache/vanejax); off ke
 from __future__ import annotations
 
 import dataclasses
-import datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,9 @@ from experiments.runner import command_line
 from experiments.runner import evaluation_pictures as pictures
 from experiments.runner.evaluation_report import hardest_views, plain, summarize, table
 from experiments.runner.experiment import Experiment
+from experiments.runner.machine import report_head
 from experiments.runner.registrations import Results, register_views
-from experiments.runner.run_folder import RunFolder, git_commit, training_record, versions
+from experiments.runner.run_folder import RunFolder, training_record
 from experiments.runner.training_record import TrainingRecord
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
@@ -33,7 +33,7 @@ from vanejax.files import write_json
 from vanejax.training.checkpoint import Checkpoints
 from vanejax.training.dataset import ScanSet, describe_source, load_scan_set
 from vanejax.training.pairs import make_bank
-from vanejax.training.train_step import Variables, init_state
+from vanejax.training.train_step import Variables, init_state, make_optimizer
 
 
 def evaluate(
@@ -103,15 +103,11 @@ def report_of(config: Experiment, scans: ScanSet, results: Results) -> dict[str,
     """What evaluation.json holds of the registrations of the test views."""
     network = config.make_network()
     times = "1 iteration" if network.iterations == 1 else f"{network.iterations} iterations"
-    report = {
-        "method": f"{network.title}, {times}, no initial guess",
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    report = {"method": f"{network.title}, {times}, no initial guess"}
+    report |= report_head(None, seed=config.seed, config=dataclasses.asdict(config))
+    report |= {
         "device": str(jax.devices()[0].device_kind),
-        "commit": git_commit(),
-        "versions": versions(),
         "part": {"name": scans.source["part"], "sha256": scans.source["part_sha256"]},
-        "seed": config.seed,
-        "config": dataclasses.asdict(config),
     }
     return plain(report | summarize(results, scans.test))
 
@@ -127,7 +123,7 @@ def load_variables(
     model, sampling = config.make_network().model, config.pair_sampling(scans)
     bank = make_bank(scans, num_reference=config.data.num_reference)
     like = jax.eval_shape(
-        lambda: init_state(model, config.make_optimizer(), bank, sampling, seed=config.seed)
+        lambda: init_state(model, make_optimizer(config.training), bank, sampling, seed=config.seed)
     )
     path = RunFolder(folder).checkpoints
     if not path.is_dir():

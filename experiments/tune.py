@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import datetime
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -27,9 +26,8 @@ from tqdm import tqdm
 
 from experiments.runner import command_line
 from experiments.runner import study_command as study
-from experiments.runner.machine import cores, cpu_model, peer_versions
+from experiments.runner.machine import PACKAGES, PEERS, report_head, versions
 from experiments.runner.registrations import Results, register_views
-from experiments.runner.run_folder import git_commit, versions
 from experiments.studies.comparison.methods import TITLES, make_method
 from experiments.studies.comparison.settings import CLASSICAL, OPEN3D, Comparison
 from experiments.train import load_or_scan
@@ -116,12 +114,8 @@ def tune(
     bank = make_bank(scans.train.select(chosen), num_reference=experiment.data.num_reference)
     report: dict[str, Any] = {
         "name": config.name,
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "machine": {"cpu": cpu_model(), "cores": cores()},
-        "commit": git_commit(),
-        "versions": versions() | peer_versions(),
-        "part": {"name": part.name, "sha256": part.sha256},
-        "seed": experiment.seed,
+        **report_head(part, seed=experiment.seed, config=dataclasses.asdict(config)),
+        "versions": versions((*PACKAGES, *PEERS)),
         "training_views": chosen,
         "score": f"mean rotation error, capped at {CAP_DEG:g} deg",
         "methods": {},

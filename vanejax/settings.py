@@ -14,6 +14,7 @@ place, beside the code that uses it:
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 import typing
 from collections.abc import Callable, Mapping
@@ -100,6 +101,22 @@ def settings_class(cls: _Class) -> _Class:
 
 class Settings:
     """Base of settings; subclasses are decorated with `settings_class`."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Sets a field.
+
+        Raises:
+          InputError: there is no such field; names those that there are.
+        """
+        names = [field.name for field in dataclasses.fields(self)]  # pyright: ignore[reportArgumentType]
+        if name not in names:
+            near = difflib.get_close_matches(name, names, 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise InputError(
+                f"{type(self).__name__} has no field {name!r}{hint} (its fields are: "
+                f"{', '.join(names)})"
+            )
+        super().__setattr__(name, value)
 
     def check(self, path: str = "") -> None:
         """Refuses what cannot be used, here and in the settings below.

@@ -27,7 +27,7 @@ from experiments.runner.evaluation_report import hardest_views, table
 from vanejax import compilation_cache
 from vanejax.training.dataset import ScanSet, load_scan_set, make_scan_set
 from vanejax.training.pairs import make_bank
-from vanejax.training.train_step import init_state
+from vanejax.training.train_step import init_state, make_optimizer
 
 
 def evaluation(bench: Bench) -> Iterator[Figure]:
@@ -85,7 +85,7 @@ def measure(scans: ScanSet) -> dict[str, float]:
     bank = make_bank(scans, num_reference=config.data.num_reference)
     sampling = config.pair_sampling(scans)
     variables = init_state(
-        config.make_network().model, config.make_optimizer(), bank, sampling, seed=0
+        config.make_network().model, make_optimizer(config.training), bank, sampling, seed=0
     ).variables
     part = config.make_part()
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):

@@ -14,7 +14,7 @@ from vanejax.cad.parametric_vane import guide_vane
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
 from vanejax.training.dataset import ScanSet, make_scan_set
 from vanejax.training.pairs import Pair, PairSampling, ScanBank, draw_pairs, make_bank
-from vanejax.training.train_step import TrainState, init_state, make_train_step
+from vanejax.training.train_step import TrainState, init_state, make_optimizer, make_train_step
 
 SOURCES, TARGETS, NEIGHBORS = 717, 1024, 32
 ELEVATIONS_DEG, AZIMUTHS_DEG = (70.0,), (10.0, 100.0, 190.0, 280.0)
@@ -74,14 +74,14 @@ class VanePairs:
 
     def state(self) -> TrainState:
         """Untrained."""
-        model, optimizer = self.config.make_network().model, self.config.make_optimizer()
+        model, optimizer = self.config.make_network().model, make_optimizer(self.config.training)
         return init_state(model, optimizer, self.bank, self.sampling, seed=0)
 
     def train_step(self):
         """The jitted step of training: ``state, metrics = step(state, bank)``."""
         return make_train_step(
             self.config.make_network().model,
-            self.config.make_optimizer(),
+            make_optimizer(self.config.training),
             self.config.make_network().loss,
             self.sampling,
             batch_size=self.batch,

@@ -3,11 +3,11 @@
 from experiments.runner.experiment import (
     DataSettings,
     Experiment,
-    LossSettings,
     ModelSettings,
     TrainingSettings,
     ViewSettings,
 )
+from vanejax.training.rpmnet_loss import RpmNetLoss
 
 
 def get_config() -> Experiment:
@@ -21,7 +21,7 @@ def get_config() -> Experiment:
         ),
         data=DataSettings(voxel_mm=4.0, num_reference=256),
         model=ModelSettings(num_neighbors=8, feature_width=32, test_iterations=2),
-        loss=LossSettings(matching=0.02, matching_sigma=0.08),
+        loss=RpmNetLoss(matching=0.02, matching_sigma=0.08),
         training=TrainingSettings(
             steps=40,
             batch_size=2,

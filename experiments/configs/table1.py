@@ -19,10 +19,10 @@ def get_config() -> Comparison:
     experiment = vane.get_config()
     # half the published width, and the help that RPM-Net gets: the assignment is told the truth
     experiment.dcp.width, experiment.dcp.hidden = 256, 512
-    experiment.dcp.matching = 0.1
+    experiment.dcp.loss.matching = 0.1
     # fewer iterations in training than at inference, for more pairs in the same time
-    experiment.pointnetlk.iterations = 5
-    experiment.pcrnet.iterations = 4
+    experiment.pointnetlk.loss.iterations = 5
+    experiment.pcrnet.loss.iterations = 4
     recipe = dataclasses.replace(experiment.training, quick_compilation=False)
     return Comparison(
         experiment=experiment,

@@ -1,7 +1,8 @@
 """The default recipe on scans without end: any view, another structured-light camera each time."""
 
-from experiments.runner.experiment import DataSettings, Experiment, LossSettings, TrainingSettings
-from experiments.runner.online import EndlessSettings
+from experiments.runner.experiment import DataSettings, Experiment, TrainingSettings
+from vanejax.training.online_scans import OnlineScans
+from vanejax.training.rpmnet_loss import RpmNetLoss
 
 
 def get_config() -> Experiment:
@@ -9,7 +10,7 @@ def get_config() -> Experiment:
     return Experiment(
         name="vane_robust",
         data=DataSettings(noise=0.005, noise_clip=0.025),
-        endless=EndlessSettings(sensor="paper_camera", casting_mm=0.5),
-        loss=LossSettings(matching=0.02, matching_sigma=0.02),
+        online=OnlineScans(sensor="paper_camera", casting_mm=0.5),
+        loss=RpmNetLoss(matching=0.02, matching_sigma=0.02),
         training=TrainingSettings(steps=2500, learning_rate=2e-3, quick_compilation=False),
     )

@@ -1,11 +1,12 @@
-"""What every experiment's command line shares: ``--config``, overrides, errors in one line."""
+"""The command lines that take a ``--config``: overrides, the work folder, errors in one line."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
 import functools
-import os
+import importlib.util
+import itertools
 import re
 import sys
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from experiments.runner.experiment import Experiment
+from experiments.runner.stopping import exit_code
 from vanejax import compilation_cache
 from vanejax.errors import InputError
 
@@ -54,44 +56,35 @@ def workdir(given: flags.FlagHolder, config: flags.FlagHolder) -> Path:
     return Path(given.value or f"runs/{name}")
 
 
-def run(main: Callable[[], int | None], *, tree: type = Experiment) -> None:
-    """Parses the command line, runs ``main`` and exits: 0, or 2 where the input is at fault.
+def run(main: Callable[[], object], *, tree: type = Experiment) -> None:
+    """Parses the command line, runs ``main`` and exits with its `exit_code`.
 
     ``tree`` is the dataclass that a config file's ``get_config()`` must return.
-
-    Compiled programs are kept: `vanejax.compilation_cache`.
     """
-    # jaxlib announces things about TPUs and GPUs that are not there
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
     def guarded(rest: list[str]) -> int:
         logging.set_verbosity(logging.ERROR)  # orbax tells of every file it writes
-        try:
-            if len(rest) > 1:
-                raise InputError(f"no such argument: {' '.join(rest[1:])}; see --help")
-            if flags.FLAGS.config is None:
-                raise InputError("--config is missing; try --config vane.py, or --help")
-            if not isinstance(flags.FLAGS.config, tree):
-                kind = type(flags.FLAGS.config).__name__
-                raise InputError(
-                    f"--config: the file holds settings of the kind {kind}, this command takes "
-                    f"{tree.__name__}; see --help"
-                )
-            compilation_cache.enable()
-            return main() or 0
-        except InputError as error:
-            print(f"error: {error}", file=sys.stderr)
-            return 2
+        return exit_code(lambda: checked(rest))
 
-    try:
-        argv = resolve_config(sys.argv)
-        app.run(guarded, argv=argv, flags_parser=functools.partial(_parse, tree))
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
+    def checked(rest: list[str]) -> None:
+        if len(rest) > 1:
+            raise InputError(f"no such argument: {' '.join(rest[1:])}; see --help")
+        if flags.FLAGS.config is None:
+            raise InputError("--config is missing; try --config vane.py, or --help")
+        if not isinstance(flags.FLAGS.config, tree):
+            kind = type(flags.FLAGS.config).__name__
+            raise InputError(
+                f"--config: the file holds settings of the kind {kind}, this command takes "
+                f"{tree.__name__}; see --help"
+            )
+        compilation_cache.enable()
+        main()
+
+    def parsed_and_run() -> None:
+        parser = functools.partial(_parse, tree)
+        app.run(guarded, argv=resolve_config(sys.argv), flags_parser=parser)
+
+    sys.exit(exit_code(parsed_and_run))
 
 
 def resolve_config(argv: list[str]) -> list[str]:
@@ -122,35 +115,49 @@ def resolve_config(argv: list[str]) -> list[str]:
 
 def _parse(tree: type, argv: list[str]) -> list[str]:
     """Absl's parser, with overrides checked first so that a typo lists the right names."""
+    config = _load(argv) or tree()
     for argument in argv[1:]:
         if match := _OVERRIDE.match(argument):
-            check_field(tree, match.group(1))
+            check_field(config, match.group(1))
     try:
         return flags.FLAGS(argv)
     except flags.IllegalFlagValueError as error:
         match = _OVERRIDE.search(str(error))
-        wanted = f"; it takes {kind_of(tree, match.group(1))}" if match else ""
+        wanted = f"; it takes {kind_of(config, match.group(1))}" if match else ""
         raise InputError(f"{error}{wanted}") from error
     except (flags.Error, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{error}; see --help") from error
 
 
-def kind_of(tree: type, path: str) -> str:
+def _load(argv: list[str]) -> Any:
+    """What the config file of a command line holds before overrides; None where none is named."""
+    for argument, following in itertools.zip_longest(argv, argv[1:]):
+        name, equals, value = argument.partition("=")
+        if name in ("--config", "-config"):
+            path = value if equals else following
+            spec = importlib.util.spec_from_file_location("config_of_this_command", path)
+            module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(module)
+            return module.get_config()
+    return None
+
+
+def kind_of(config: Any, path: str) -> str:
     """What a field holds, such as "an int, for example 32"."""
-    value: Any = tree()
+    value: Any = config
     for name in path.split("."):
         value = getattr(value, name)
     kind = type(value).__name__
     return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}, for example {value!r}"
 
 
-def check_field(tree: type, path: str) -> None:
-    """Refuses a path such as ``model.num_neighbors`` that names no field of the tree.
+def check_field(config: Any, path: str) -> None:
+    """Refuses a path such as ``model.num_neighbors`` that names no field of the config.
 
     Raises:
       InputError: names what is there, and what is near.
     """
-    node: Any = tree()
+    node: Any = config
     walked = "config"
     for name in path.split("."):
         names = [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []

@@ -1,18 +1,49 @@
-"""What this machine is and can do: the facts that a time means nothing without."""
+"""What a result rests on: this machine, the installed versions, the commit; and a report's head."""
 
 from __future__ import annotations
 
+import datetime
 import importlib.metadata
 import os
 import platform
+import subprocess
 import time
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from vanejax.cad.part import Part
+
 MATMUL_SIZE = 2048
+PACKAGES = ("vanejax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "embreex")
 PEERS = ("open3d", "small_gicp", "torch")
+
+
+def report_head(part: Part | None, *, seed: int, config: Any) -> dict[str, Any]:
+    """What was run, when, on what, from which source: the first entries of a report's JSON."""
+    return {
+        "date": now(),
+        "machine": {
+            "cpu": cpu_model(),
+            "processor": platform.machine(),
+            "cores": cores(),
+            "load": os.getloadavg()[0],
+        },
+        "commit": git_commit(),
+        "versions": versions(),
+        "python": platform.python_version(),
+        "part": None if part is None else {"name": part.name, "sha256": part.sha256},
+        "seed": seed,
+        "config": config,
+    }
+
+
+def now() -> str:
+    """Date and time to the second, UTC, in ISO 8601."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
 def cpu_model() -> str:
@@ -32,15 +63,29 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-def peer_versions() -> dict[str, str | None]:
-    """Installed versions of the libraries that are compared with; None where there is none."""
-    found: dict[str, str | None] = {}
-    for name in PEERS:
+def versions(packages: Iterable[str] = PACKAGES) -> dict[str, str | None]:
+    """Installed versions of packages; None where one is not installed."""
+    installed: dict[str, str | None] = {}
+    for name in packages:
         try:
-            found[name] = importlib.metadata.version(name)
+            installed[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            found[name] = None
-    return found
+            installed[name] = None
+    return installed
+
+
+def git_commit() -> str | None:
+    """The commit of the source tree, with "+" where it has changes; None outside of git."""
+    here = Path(__file__).parent
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(here), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
 
 
 def flops_per_second(repeats: int, size: int = MATMUL_SIZE) -> list[float]:

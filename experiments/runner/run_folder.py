@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import fcntl
-import importlib.metadata
 import json
 import os
 import platform
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from experiments.runner.experiment import Experiment
+from experiments.runner.machine import git_commit, now, versions
 from experiments.runner.training_record import TrainingRecord
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.files import read_json, write_json, write_text
+from vanejax.settings import values_of, with_defaults
 
-PACKAGES = ("vanejax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "embreex")
 CLOCK = "clock.json"
 
 
@@ -76,7 +74,7 @@ class RunFolder:
         mine = {"config": settings, "part": {"name": part.name, "sha256": part.sha256}}
         record = self.path / "run.json"
         if record.exists():
-            theirs = read_json(record)
+            theirs = read_record(self.path, config)
             changed = list(differences(theirs, mine))
             if changed:
                 raise InputError(
@@ -88,7 +86,7 @@ class RunFolder:
             "versions": versions(),
             "python": platform.python_version(),
             "commit": git_commit(),
-            "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            "started": now(),
         }
         write_json(record, mine | environment)
 
@@ -130,6 +128,29 @@ class RunFolder:
             self._events.add_scalar(name, value, step)
 
 
+def read_record(folder: Path, config: Experiment) -> dict[str, Any]:
+    """The run.json of a folder, its config in today's form.
+
+    A run of an earlier version lacks fields that came since; they have their defaults. Online
+    scans were called endless, and the settings of a baseline's loss stood beside its network's.
+
+    Raises:
+      InputError: it cannot be read.
+    """
+    record = read_json(folder / "run.json")
+    theirs = dict(record.get("config", {}))
+    if "endless" in theirs:
+        theirs["online"] = theirs.pop("endless")
+    for name in ("dcp", "pointnetlk", "pcrnet"):
+        group, loss = theirs.get(name, {}), getattr(config, name).loss
+        if "loss" not in group:
+            of_loss = {key: group[key] for key in values_of(type(loss), loss) if key in group}
+            rest = {key: value for key, value in group.items() if key not in of_loss}
+            theirs[name] = rest | {"loss": of_loss}
+    defaults = json.loads(json.dumps(dataclasses.asdict(type(config)())))
+    return record | {"config": with_defaults(theirs, defaults)}
+
+
 def read_log(folder: str | os.PathLike[str]) -> list[dict[str, float]]:
     """The rows of a run's JSONL log; a last line cut off by a kill is left out."""
     path = Path(folder) / "metrics.jsonl"
@@ -152,31 +173,6 @@ def training_record(folder: str | os.PathLike[str]) -> TrainingRecord:
 def _read_seconds(folder: Path) -> float:
     clock = folder / CLOCK
     return float(read_json(clock)["seconds"]) if clock.exists() else 0.0
-
-
-def versions() -> dict[str, str | None]:
-    """Installed versions of the packages that a result rests on; None where run from a checkout."""
-    found: dict[str, str | None] = {}
-    for name in PACKAGES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = None
-    return found
-
-
-def git_commit() -> str | None:
-    """The commit of the source tree, with "+" where it has changes; None outside of git."""
-    here = Path(__file__).parent
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(here), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return None
 
 
 def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:

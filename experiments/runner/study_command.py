@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import datetime
-import os
-import platform
+import statistics
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
 from experiments.runner.evaluation_report import plain
-from experiments.runner.run_folder import git_commit, versions
+from experiments.runner.machine import report_head
+from experiments.runner.stopping import exit_code
 from vanejax import compilation_cache
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
@@ -37,44 +36,16 @@ def make_parser(name: str, description: str | None) -> argparse.ArgumentParser:
 
 
 def run(main: Callable[[argparse.Namespace], object], parser: argparse.ArgumentParser) -> NoReturn:
-    """Parses the command line, runs ``main`` and exits: 0, or 2 where the input is at fault.
-
-    Compiled programs are kept: `vanejax.compilation_cache`.
-    """
-    # jaxlib announces things about TPUs and GPUs that are not there
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    """Parses the command line, runs ``main`` and exits with its `exit_code`."""
     settings = parser.parse_args()
     compilation_cache.enable()
-    try:
-        main(settings)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
-    sys.exit(0)
+    sys.exit(exit_code(lambda: main(settings)))
 
 
 def header(method: str, settings: argparse.Namespace, part: Part | None = None) -> dict[str, Any]:
-    """What was run, on what, from which source: the first entries of a study's JSON."""
+    """`report_head` of a study, whose config is its command line."""
     config = {k: str(v) if isinstance(v, Path) else v for k, v in vars(settings).items()}
-    named = None if part is None else {"name": part.name, "sha256": part.sha256}
-    return {
-        "method": method,
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "machine": {
-            "processor": platform.machine(),
-            "cores": os.cpu_count(),
-            "load": os.getloadavg()[0],
-        },
-        "commit": git_commit(),
-        "versions": versions(),
-        "python": platform.python_version(),
-        "part": named,
-        "seed": settings.seed,
-        "config": config,
-    }
+    return {"method": method} | report_head(part, seed=settings.seed, config=config)
 
 
 def save(folder: Path, name: str, report: dict[str, Any]) -> dict[str, Any]:
@@ -123,7 +94,4 @@ def count(text: str) -> int:
 
 def spread(seconds: list[float]) -> dict[str, float]:
     """Median, smallest and largest of some times."""
-    ordered = sorted(seconds)
-    half = len(ordered) // 2
-    median = ordered[half] if len(ordered) % 2 else 0.5 * (ordered[half - 1] + ordered[half])
-    return {"median": median, "min": ordered[0], "max": ordered[-1]}
+    return {"median": statistics.median(seconds), "min": min(seconds), "max": max(seconds)}

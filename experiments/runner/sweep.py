@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import copy
 import dataclasses
+import functools
 import hashlib
 import itertools
 import json
@@ -64,10 +65,7 @@ class Cell:
         config.seed = self.seed
         for field, value in self.overrides:
             *groups, name = field.split(".")
-            node: Any = config
-            for group in groups:
-                node = getattr(node, group)
-            setattr(node, name, value)
+            setattr(functools.reduce(getattr, groups, config), name, value)
         return config
 
 
@@ -80,8 +78,23 @@ def grid(sweeps: Sequence[Sweep], seeds: Sequence[int]) -> list[Cell]:
     ]
 
 
-def parse_sweeps(words: Sequence[str]) -> list[Sweep]:
-    """Sweeps from ``FIELD=VALUE,VALUE,...``, each value typed as its field is.
+def check_used(cells: Sequence[Cell], base: Experiment) -> None:
+    """Refuses cells that change what their network does not use: they would be one training.
+
+    Raises:
+      InputError: names the field, and those that the network does use.
+    """
+    for cell in cells:
+        config = cell.config(base)
+        for field, _ in cell.overrides:
+            try:
+                config.check_used(field)
+            except InputError as error:
+                raise InputError(f"--sweep {str(error).removeprefix('--sweep ')}") from error
+
+
+def parse_sweeps(words: Sequence[str], config: Experiment) -> list[Sweep]:
+    """Sweeps from ``FIELD=VALUE,VALUE,...``, each value typed as the config's field is.
 
     A tuple is written in brackets, a text with a comma in quotes:
     ``views.elevations_deg=(60,70),(80,85)``.
@@ -91,7 +104,7 @@ def parse_sweeps(words: Sequence[str]) -> list[Sweep]:
     """
     if not words:
         raise InputError("--sweep is missing; try --sweep model.num_neighbors=16,32")
-    sweeps = [_parse_sweep(word) for word in words]
+    sweeps = [_parse_sweep(word, config) for word in words]
     for field in (fields := [sweep.field for sweep in sweeps]):
         if fields.count(field) > 1:
             raise InputError(f"--sweep {field}: given twice; put all its values into one")
@@ -112,7 +125,7 @@ def parse_seeds(words: Sequence[str], default: int) -> tuple[int, ...]:
     return seeds
 
 
-def _parse_sweep(word: str) -> Sweep:
+def _parse_sweep(word: str, config: Experiment) -> Sweep:
     field, equals, text = word.partition("=")
     field = field.removeprefix("config.")
     if not equals:
@@ -120,10 +133,10 @@ def _parse_sweep(word: str) -> Sweep:
     if field == "seed":
         raise InputError("--sweep seed: seeds have an option of their own, such as --seeds 0,1,2")
     try:
-        command_line.check_field(Experiment, field)
+        command_line.check_field(config, field)
     except InputError as error:
         raise InputError(f"--sweep {str(error).removeprefix('--config.')}") from error
-    kind = _type_of(field)
+    kind = _type_of(config, field)
     try:
         texts = _split(text)
     except ValueError as error:
@@ -133,7 +146,7 @@ def _parse_sweep(word: str) -> Sweep:
         try:
             values.append(_parse_value(value, kind))
         except (ValueError, SyntaxError):
-            wanted = command_line.kind_of(Experiment, field)
+            wanted = command_line.kind_of(config, field)
             raise InputError(f"--sweep {field}: {value!r} will not do; it takes {wanted}") from None
     _refuse_twice(f"--sweep {field}", values)
     return Sweep(field, tuple(values))
@@ -145,11 +158,10 @@ def _refuse_twice(where: str, values: Sequence[Any]) -> None:
             raise InputError(f"{where}: {value!r} is there twice")
 
 
-def _type_of(field: str) -> Any:
-    node: Any = Experiment
-    for name in field.split("."):
-        node = next(entry.type for entry in dataclasses.fields(node) if entry.name == name)
-    return node
+def _type_of(config: Experiment, field: str) -> Any:
+    *groups, name = field.split(".")
+    node = functools.reduce(getattr, groups, config)
+    return next(entry.type for entry in dataclasses.fields(node) if entry.name == name)
 
 
 def _split(text: str) -> list[str]:

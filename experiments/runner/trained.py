@@ -9,12 +9,11 @@ from pathlib import Path
 
 from experiments.evaluate import load_variables
 from experiments.runner.experiment import Experiment
-from experiments.runner.run_folder import RunFolder, differences, training_record
+from experiments.runner.run_folder import RunFolder, differences, read_record, training_record
 from experiments.runner.training_record import TrainingRecord
 from experiments.train import fit
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.files import read_json
 from vanejax.matching.torch_weights import load_state_dict, rpmnet_variables
 from vanejax.training.dataset import ScanSet
 from vanejax.training.train_step import Variables
@@ -60,9 +59,9 @@ def trained(
         if config.model.name != "rpmnet":
             raise InputError(f"{given}: weights from PyTorch are read for an RPM-Net only")
         return Trained(rpmnet_variables(load_state_dict(given)), config, None)
-    record = read_json(given / "run.json")
+    record = read_record(given, config)
     mine = json.loads(json.dumps(dataclasses.asdict(config)))
-    theirs = record.get("config", {})
+    theirs = record["config"]
     # what decides how a network is built and tested; how it was trained is told, not asked for
     groups = ("part", "views", "data", "model", config.model.name)
     names = [name for name in groups if name in mine]

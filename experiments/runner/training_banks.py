@@ -42,9 +42,9 @@ def training_banks(
         return _fixed(
             ShapeBank(points=jnp.asarray(shapes.points), normals=jnp.asarray(shapes.normals))
         )
-    if not config.endless.sensor:
+    if not config.online.sensor:
         return _fixed(make_bank(scans.train, num_reference=config.data.num_reference))
-    settings, training = config.endless, config.training
+    settings, training = config.online, config.training
     sampling = config.pair_sampling(scans)
     stream = settings.stream(
         part, scans, sampling, batch_size=training.batch_size, seed=config.seed

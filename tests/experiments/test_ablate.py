@@ -8,21 +8,20 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
+from example_experiment import tiny_experiment
 
 from experiments import ablate
 from experiments.configs.smoke import get_config
 from experiments.runner.experiment import Experiment
 from experiments.runner.run_folder import RunFolder
+from experiments.runner.stopping import Interrupted, TrainingDiverged, exit_code
 from experiments.runner.sweep import Cell, Sweep, grid
 from experiments.runner.trained import Trained
 from experiments.runner.training_record import TrainingRecord
 from experiments.studies.ablation import picture as ablation_picture
 from experiments.studies.ablation.table import over_seeds, table
-from experiments.train import Interrupted, TrainingDiverged
 from vanejax.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -115,18 +114,22 @@ def test_what_is_finished_is_not_run_again(mock: Mock, tmp_path) -> None:
 
 def test_a_signal_keeps_what_is_done_and_the_rest_goes_on(mock: Mock, tmp_path, capsys) -> None:
     mock.trouble = {
-        1: Interrupted(signal.SIGTERM, 7),
+        1: Interrupted(signal.SIGTERM, 7, tmp_path),
         2: KeyboardInterrupt(),
     }
-    assert ablate.main(get_config(), tmp_path, SWEEPS, (0,)) == 128 + signal.SIGTERM
+
+    def ablation() -> int:
+        return exit_code(lambda: ablate.ablate(get_config(), SWEEPS, (0,), tmp_path))
+
+    assert ablation() == 128 + signal.SIGTERM
     error = capsys.readouterr().err
     assert "stopped by SIGTERM after step 7" in error
     assert error.count("\n") == 1
     assert len(lines(tmp_path)) == 1
-    assert ablate.main(get_config(), tmp_path, SWEEPS, (0,)) == 130
+    assert ablation() == 130
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "ablation.json").exists()
-    assert ablate.main(get_config(), tmp_path, SWEEPS, (0,)) == 0
+    assert ablation() == 0
     names = [cell.name for cell in grid(SWEEPS, (0,))]
     assert [row["cell"] for row in lines(tmp_path)] == names
     assert len(mock.trained) == 6  # the second cell was begun three times, the others once
@@ -178,6 +181,7 @@ def test_settings_that_cannot_be_run_are_refused_before_anything_is(mock: Mock, 
     for sweep, message in (
         (Sweep("data.noise", (0.0, -1.0)), r"config\.data\.noise=-1\.0"),
         (Sweep("model.name", ("rpmnet", "rpmnett")), "did you mean rpmnet"),
+        (Sweep("dcp.loss.cycle", (0.0, 0.1)), "rpmnet does not use it.* model.radius.* loss.pose"),
         (Sweep("views.azimuths_deg", ((0.0, 20.0), (20.0,))), "both kinds are needed"),
         (Sweep("views.azimuths_deg", ((0.0, 20.0), (40.0,))), "both kinds are needed"),
     ):
@@ -312,30 +316,9 @@ def test_which_values_want_a_logarithmic_axis(values, wanted: bool) -> None:
     assert ablation_picture.geometric(values) is wanted
 
 
-@pytest.fixture
-def hasty_compiler(tmp_path):
-    """XLA without most of its passes, and each program once: they compile longer than they run."""
-    wanted = {
-        "jax_disable_most_optimizations": True,
-        "jax_compilation_cache_dir": str(tmp_path / "programs"),
-        "jax_persistent_cache_min_compile_time_secs": 0,
-    }
-    before = {name: jax.config.values[name] for name in wanted}
-    for name, value in wanted.items():
-        jax.config.update(name, value)
-    yield
-    for name, value in before.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
-
-
 def test_two_cells_from_scans_to_picture(tmp_path, capsys, hasty_compiler) -> None:
-    config = get_config()
-    config.views.elevations_deg, config.views.azimuths_deg = (60.0,), (0.0, 20.0, 40.0, 60.0)
-    config.data.num_reference, config.training.steps = 64, 2
-    config.training.validation_pairs = 2
-    # the network that compiles soonest
-    config.model.name, config.pcrnet.iterations, config.pcrnet.test_iterations = "pcrnet", 1, 1
+    config = tiny_experiment()
+    config.training.steps = 2
     # two cells that compile to the same programs, under another noise than the config's
     sweeps = [Sweep("training.log_every", (1, 2)), Sweep("data.noise", (0.02,))]
     report = ablate.ablate(config, sweeps, (0,), tmp_path)
@@ -368,7 +351,10 @@ def test_the_command_lists_cells_and_refuses_in_one_line(tmp_path) -> None:
     assert done.stdout.splitlines()[0] == "data.noise=0.0,seed=0: 40 steps, 2 min at most"
     assert len(done.stdout.splitlines()) == 4
     assert not (tmp_path / "run").exists()
-    done = run("--sweep", "data.nois=0,0.01")
+    done = run("--sweep", "model.num_neighbors=8,16", "--config.model.name=pointnetlk", "--cells")
     assert done.returncode == 2
-    assert done.stderr.startswith("error: --sweep data.nois: config.data has no 'nois'; did you")
+    assert done.stderr.startswith(
+        "error: --sweep model.num_neighbors: pointnetlk does not use it; its fields are "
+        "pointnetlk.delta, "
+    )
     assert done.stderr.count("\n") == 1

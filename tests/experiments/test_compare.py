@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments import compare as command
-from experiments.compare import compare, figures, main
+from experiments.compare import compare, figures
 from experiments.configs import smoke, table1
 from experiments.runner.registrations import register_views
 from experiments.runner.trained import given_runs, trained
@@ -167,14 +167,6 @@ def test_the_config_of_table_1_has_all_methods_with_their_settings() -> None:
     assert dcp.model.name == "dcp"
     assert dcp.training.steps == config.training.dcp.steps
     assert dcp.data == config.experiment.data
-
-
-def test_methods_on_the_command_line_replace_the_configs(monkeypatch, tmp_path: Path) -> None:
-    seen = []
-    monkeypatch.setattr(command, "compare", lambda config, *rest: seen.append(config.methods))
-    assert main(small(), tmp_path, ["fgr"], []) == 0
-    assert main(small(), tmp_path, [], []) == 0
-    assert seen == [("fgr",), ("icp", "pcrnet")]
 
 
 def test_the_classical_methods_stand_beside_open3ds(report: dict) -> None:

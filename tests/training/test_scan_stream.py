@@ -178,4 +178,4 @@ def test_views_keep_their_ranges(seed, near, more, low):
 )
 def test_ranges_that_hold_nothing_are_refused(name, value):
     with pytest.raises(InputError, match=name):
-        RandomViews(**{name: value})
+        RandomViews(**{name: value}).check("online")

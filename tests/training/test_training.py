@@ -20,7 +20,13 @@ from vanejax.training import loss_terms as losses
 from vanejax.training import train_step as training
 from vanejax.training.pairs import Pair, PairSampling, ScanBank
 from vanejax.training.rpmnet_loss import RpmNetLoss
-from vanejax.training.train_step import init_state, make_optimizer, make_train_step, views_of_step
+from vanejax.training.train_step import (
+    OptimizerSettings,
+    init_state,
+    make_optimizer,
+    make_train_step,
+    views_of_step,
+)
 
 
 class Twist(nn.Module):
@@ -60,7 +66,9 @@ def make_match(source: PointCloud, target: PointCloud, twist: jax.Array) -> Matc
 
 SAMPLING = PairSampling(num_reference=24, num_source=16)
 MODEL = Twist()
-OPTIMIZER = make_optimizer(learning_rate=1e-3, steps=100, warmup_steps=0, clip_norm=1.0)
+OPTIMIZER = make_optimizer(
+    OptimizerSettings(learning_rate=1e-3, steps=100, warmup_steps=0, clip_norm=1.0)
+)
 LOSS = RpmNetLoss(iterations=1, matching=0.05, partner=0.5)
 DECAY = 0.3
 
@@ -212,7 +220,9 @@ def test_every_epoch_visits_each_view_once(batch_size, num_views):
 def test_the_schedule_warms_up_and_decays():
     """Under a constant gradient Adam's update is the learning rate itself."""
     optimizer = make_optimizer(
-        learning_rate=0.1, steps=40, warmup_steps=10, clip_norm=5.0, final_fraction=0.25
+        OptimizerSettings(
+            learning_rate=0.1, steps=40, warmup_steps=10, clip_norm=5.0, final_fraction=0.25
+        )
     )
     weights = jnp.zeros(2)
     state, rates = optimizer.init(weights), []
@@ -228,7 +238,9 @@ def test_the_schedule_warms_up_and_decays():
 
 
 def test_a_warm_up_longer_than_the_run_is_no_error():
-    optimizer = make_optimizer(learning_rate=0.1, steps=3, warmup_steps=10, clip_norm=1.0)
+    optimizer = make_optimizer(
+        OptimizerSettings(learning_rate=0.1, steps=3, warmup_steps=10, clip_norm=1.0)
+    )
     state = optimizer.init(jnp.zeros(2))
     for _ in range(3):  # the whole run is warm-up: steps grow and stay finite
         update, state = optimizer.update(jnp.ones(2), state, jnp.zeros(2))
@@ -238,7 +250,9 @@ def test_a_warm_up_longer_than_the_run_is_no_error():
 
 def test_gradients_are_clipped_by_their_global_norm():
     """A spike of 1e6 leaves the moments as its unit vector would."""
-    optimizer = make_optimizer(learning_rate=0.1, steps=10, warmup_steps=0, clip_norm=1.0)
+    optimizer = make_optimizer(
+        OptimizerSettings(learning_rate=0.1, steps=10, warmup_steps=0, clip_norm=1.0)
+    )
     direction = {"a": jnp.array([0.6, 0.0]), "b": jnp.array(0.8)}
     states = []
     for scale in (1.0, 1e6):

@@ -28,7 +28,7 @@ from vanejax.training import weight_file
 from vanejax.training.checkpoint import Checkpoints
 from vanejax.training.dataset import ScanSet, make_scan_set
 from vanejax.training.export import export_workdir
-from vanejax.training.train_step import TrainState
+from vanejax.training.train_step import TrainState, make_optimizer
 from vanejax.training.weight_file import (
     TrainedMatcher,
     abstract_variables,
@@ -78,7 +78,7 @@ def workdir(config: Experiment, part: Part, scans: ScanSet, tmp_path_factory) ->
             step=jnp.asarray(0, jnp.int32),
             variables=variables,
             average=variables,
-            opt_state=config.make_optimizer().init(variables),
+            opt_state=make_optimizer(config.training).init(variables),
         )
         with Checkpoints(folder.checkpoints) as checkpoints:
             for step, score in ((10, 1.0), (20, 2.0)):

@@ -134,7 +134,7 @@ class RpmNetSettings(Settings):
     feature_width: int = multiple_of(8, 96)
 
 
-class RpmNet(RpmNetSettings, nn.Module):
+class RpmNet(nn.Module, RpmNetSettings):
     """RPM-Net for one pair; `jax.vmap` over pairs. Its fields are `RpmNetSettings`."""
 
     def setup(self) -> None:

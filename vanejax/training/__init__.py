@@ -9,11 +9,18 @@ from vanejax.training.dataset import ScanSet, load_scan_set, make_scan_set
 from vanejax.training.pairs import Pair, PairSampling, draw_pairs, make_bank
 from vanejax.training.pretrained import find_weights
 from vanejax.training.rpmnet_loss import RpmNetLoss
-from vanejax.training.train_step import TrainState, init_state, make_optimizer, make_train_step
+from vanejax.training.train_step import (
+    OptimizerSettings,
+    TrainState,
+    init_state,
+    make_optimizer,
+    make_train_step,
+)
 from vanejax.training.weight_file import TrainedMatcher, load_model, save_model
 
 __all__ = [
     "Checkpoints",
+    "OptimizerSettings",
     "Pair",
     "PairSampling",
     "RpmNetLoss",

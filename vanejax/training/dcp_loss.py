@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -13,11 +12,11 @@ from vanejax.matching.metrics import pose_metrics
 from vanejax.matching.procrustes import weighted_procrustes
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
+from vanejax.settings import Settings, factor, not_negative, positive, settings_class
 from vanejax.training import loss_terms as losses
-from vanejax.training.gradient_accumulation import accumulate
+from vanejax.training.gradient_sums import mean_over_pairs
 from vanejax.training.pairs import Pair
-
-Metrics = dict[str, jax.Array]
+from vanejax.training.train_step import Metrics
 
 
 def rotation_loss(found: RigidTransform, truth: RigidTransform) -> jax.Array:
@@ -51,8 +50,8 @@ def cycle_loss(match: Match, source: PointCloud, target: PointCloud) -> jax.Arra
     return rotation_loss(there_and_back, still) + translation_loss(there_and_back, still)
 
 
-@dataclasses.dataclass(frozen=True)
-class DcpLoss:
+@settings_class
+class DcpLoss(Settings):
     """The loss of DCP after one iteration, and what vanejax may add to it.
 
     Attributes:
@@ -63,11 +62,11 @@ class DcpLoss:
       matching_sigma: its width, unit-sphere units.
     """
 
-    rotation: float = 1.0
-    translation: float = 1.0
-    cycle: float = 0.0
-    matching: float = 0.0
-    matching_sigma: float = 0.04
+    rotation: float = factor(1.0)
+    translation: float = factor(1.0)
+    cycle: float = not_negative(0.0)
+    matching: float = factor(0.0)
+    matching_sigma: float = positive(0.04)
 
     def of_match(self, match: Match, pair: Pair) -> tuple[jax.Array, Metrics]:
         """Loss [] of one pair, and its parts."""
@@ -97,17 +96,13 @@ class DcpLoss:
         embedding = model.apply(variables, pairs.target, method="embed")
 
         def of_pair(
-            shared: tuple[Any, Embedding],
-            carry: tuple[()],
-            pair: tuple[PointCloud, RigidTransform],
-        ) -> tuple[jax.Array, tuple[()], Metrics]:
-            (variables, embedding), (source, truth) = shared, pair
+            shared: tuple[Any, Embedding], source: PointCloud, truth: RigidTransform
+        ) -> tuple[jax.Array, Metrics]:
+            variables, embedding = shared
             init = jax.tree.map(jnp.asarray, RigidTransform.identity())
             match = model.apply(variables, source, pairs.target, embedding, init, method="match")
             pair = Pair(source=source, target=pairs.target, target_from_source=truth)
             value, parts = self.of_match(match, pair)
-            return value, carry, parts | pose_metrics(match.target_from_source, truth)
+            return value, parts | pose_metrics(match.target_from_source, truth)
 
-        batch = (pairs.source, pairs.target_from_source)
-        total, _, metrics = accumulate(of_pair, (variables, embedding), (), batch)
-        return total / pairs.source.mask.shape[0], jax.tree.map(jnp.mean, metrics)
+        return mean_over_pairs(of_pair, (variables, embedding), pairs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import Any, Literal
@@ -15,8 +16,8 @@ from vanejax.matching.rpmnet import RpmNet
 from vanejax.scanner.camera import Camera
 from vanejax.training.checkpoint import Checkpoints
 from vanejax.training.dataset import ScanSet, load_scan_set
-from vanejax.training.pairs import PairSampling, source_sizes
-from vanejax.training.train_step import TrainState, make_optimizer
+from vanejax.training.pairs import PairSampling
+from vanejax.training.train_step import OptimizerSettings, TrainState, make_optimizer
 from vanejax.training.weight_file import (
     TrainedMatcher,
     abstract_variables,
@@ -108,11 +109,9 @@ def _evaluation(path: Path) -> dict[str, Any] | None:
 
 
 def _sampling(data: dict[str, Any], scans: ScanSet) -> PairSampling:
-    names = ("num_reference", "noise", "noise_clip", "max_rotation_deg", "max_translation")
-    settings = {name: data[name] for name in names}
-    # the rows of a source fit the view that sees most, as in training
-    rows = int(source_sizes(scans, settings["num_reference"]).max())
-    return PairSampling(num_source=rows, **settings)
+    names = {field.name for field in dataclasses.fields(PairSampling)} - {"num_source"}
+    sampling = PairSampling(**{name: data[name] for name in names})
+    return dataclasses.replace(sampling, num_source=data.get("num_source", 0)).fitted(scans)
 
 
 def _read_weights(workdir: Path, model: RpmNet, checkpoint: Which) -> tuple[Any, int]:
@@ -122,7 +121,7 @@ def _read_weights(workdir: Path, model: RpmNet, checkpoint: Which) -> tuple[Any,
         raise InputError(f"{workdir}: holds no checkpoints; train first")
     variables = abstract_variables(model)
     # only its structure counts, which no number changes
-    optimizer = make_optimizer(learning_rate=1.0, steps=1, warmup_steps=0, clip_norm=1.0)
+    optimizer = make_optimizer(OptimizerSettings())
     like = TrainState(
         step=jax.ShapeDtypeStruct((), np.int32),
         variables=variables,

@@ -1,4 +1,4 @@
-"""Scans without end: every training step gets new ones, from anywhere, by another camera.
+"""Online scans: every training step gets new ones, from anywhere, by another camera.
 
 Scan number n is made from ``default_rng([seed, n])`` alone: viewpoint, distance, roll, sensor and
 casting. Step s takes the scans ``B s`` to ``B s + B - 1``, so that a run can begin at any step and
@@ -17,26 +17,30 @@ from contextlib import contextmanager
 import jax.numpy as jnp
 import numpy as np
 
+from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.pointcloud import PointCloud, voxel_thin
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import look_at
 from vanejax.scanner.measurement import measure
-from vanejax.scanner.sensor import Sensor
+from vanejax.scanner.sensor import Sensor, preset
 from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.normals import estimate_normals
-from vanejax.training.pairs import ScanBank
+from vanejax.settings import Settings, bounded, not_negative, positive, settings_class, share
+from vanejax.training.dataset import ScanSet
+from vanejax.training.pairs import PairSampling, ScanBank, make_bank
 
 # more than a log interval: the loop runs ahead of the device between two looks at its metrics
 STEPS_AHEAD = 16
 LEAST_POINTS = 32
 ATTEMPTS = 20
+_CASTINGS = 0xCA57  # folded into the seed: castings are drawn from another stream than scans
 _AHEAD_OF_VALIDATION = 1 << 40  # scan numbers that no training reaches
 
 
-@dataclasses.dataclass(frozen=True)
-class RandomViews:
+@settings_class
+class RandomViews(Settings):
     """From where a part is seen: uniform in each of these.
 
     Attributes:
@@ -46,25 +50,20 @@ class RandomViews:
       roll_deg: the camera turns about its axis by up to this, either way; the projector with it.
       aside: the part's centre is off the optical axis by up to this share of the distance, in x and
         in y.
-
-    Raises:
-      InputError: ranges that hold nothing.
     """
 
-    distance_mm: tuple[float, float] = (300.0, 500.0)
-    elevation_deg: tuple[float, float] = (40.0, 90.0)
-    roll_deg: float = 180.0
-    aside: float = 0.04
-
-    def __post_init__(self) -> None:
-        near, far = self.distance_mm
-        low, high = self.elevation_deg
-        if not 0 < near <= far < np.inf:
-            raise InputError(f"distance_mm={self.distance_mm!r} must be (least, most), in mm")
-        if not -90 <= low <= high <= 90:
-            raise InputError(
-                f"elevation_deg={self.elevation_deg!r} must be (least, most) within -90 and 90"
-            )
+    distance_mm: tuple[float, float] = bounded(
+        (300.0, 500.0),
+        lambda ends: 0 < ends[0] <= ends[1] < np.inf,
+        "be (least, most), in mm",
+    )
+    elevation_deg: tuple[float, float] = bounded(
+        (40.0, 90.0),
+        lambda ends: -90 <= ends[0] <= ends[1] <= 90,
+        "be (least, most) within -90 and 90",
+    )
+    roll_deg: float = not_negative(180.0)
+    aside: float = not_negative(0.04)
 
     def draw(self, rng: np.random.Generator, center: np.ndarray) -> RigidTransform:
         """camera_from_part, [3, 3] and [3] mm, of a part with this ``center`` [3] mm."""
@@ -78,6 +77,75 @@ class RandomViews:
         turn = np.eye(3)
         turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
         return RigidTransform(turn, sideways) @ look_at(center + distance * outward, center)
+
+
+@settings_class
+class OnlineScans(RandomViews):
+    """New scans for every step, each from a random view by a random sensor.
+
+    Attributes:
+      sensor: each scan is by a sensor of this kind, a name of `vanejax.scanner.sensor.PRESETS`;
+        empty for the fixed scans.
+      effects: off for an ideal camera of the same pixels, view and range in the sensor's place.
+      resolution: share of the sensor's pixels per side.
+      casting_mm: largest allowance of the castings that are scanned; 0 for the CAD model itself.
+      castings: how many different ones there are.
+      workers: threads that scan ahead; they change no result.
+    """
+
+    sensor: str = ""
+    effects: bool = True
+    resolution: float = share(0.25)
+    casting_mm: float = not_negative(0.0)
+    castings: int = positive(16)
+    workers: int = positive(1)
+
+    def check(self, path: str = "") -> None:
+        """As `Settings.check`; the sensor is one of the presets."""
+        super().check(path)
+        if self.sensor:
+            preset(self.sensor)
+
+    def make_sensor(self) -> Sensor:
+        """The sensor, or an ideal camera in its place; at full resolution."""
+        sensor = preset(self.sensor)
+        return sensor if self.effects else Sensor(camera=sensor.camera)
+
+    def make_parts(self, part: Part, seed: int) -> list[Part]:
+        """The parts that are scanned: the CAD model, or castings of it."""
+        if not self.casting_mm:
+            return [part]
+        return [
+            as_cast(part, random_casting(rng, self.casting_mm), rng)
+            for rng in (np.random.default_rng([seed, _CASTINGS, k]) for k in range(self.castings))
+        ]
+
+    def stream(
+        self, part: Part, scans: ScanSet, sampling: PairSampling, *, batch_size: int, seed: int
+    ) -> ScanStream:
+        """The stream of scans, with the thinned surface and the voxels of ``scans``."""
+        return ScanStream(
+            part=part,
+            reference=make_bank(scans, num_reference=sampling.num_reference).reference,
+            sensor=self.make_sensor().scaled(self.resolution),
+            views=self,
+            castings=[Scanner(casting) for casting in self.make_parts(part, seed)],
+            batch_size=batch_size,
+            num_reference=sampling.num_reference,
+            num_source=sampling.num_source,
+            voxel_mm=float(scans.source["voxel_mm"]),
+            seed=seed,
+        )
+
+
+def random_casting(rng: np.random.Generator, most_mm: float) -> InvestmentCasting:
+    """Stock of up to ``most_mm``; waves (one deviation) and a bow of up to a fifth of it."""
+    return InvestmentCasting(
+        allowance_mm=rng.uniform(0, most_mm),
+        waviness_mm=rng.uniform(0, most_mm / 5),
+        wavelength_mm=rng.uniform(20, 60),
+        bow_mm=rng.uniform(0, most_mm / 5),
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

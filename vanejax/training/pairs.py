@@ -6,7 +6,6 @@ is JAX code driven by a key, so that the same key gives the same pair on any mac
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Protocol
 
 import flax.struct
@@ -18,6 +17,7 @@ from vanejax.errors import InputError
 from vanejax.matching.se3 import exp_so3
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
+from vanejax.settings import Settings, not_negative, positive, settings_class, values_of
 from vanejax.training.dataset import ScanSet
 
 
@@ -73,13 +73,14 @@ class Bank(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True)
-class PairSampling:
-    """How pairs are drawn; the defaults are the paper's.
+@settings_class
+class PairSampling(Settings):
+    """How pairs are drawn; the defaults are the paper's (section III.D).
 
     Attributes:
-      num_reference: M, points of the reference.
-      num_source: N, rows of every source, at least the largest of a bank's ``source_sizes``.
+      num_reference: M, points of the reference; a source has M X / Y.
+      num_source: N, rows of every source, and the most points that it has; 0 stands for what the
+        view that sees most needs, see `fitted`.
       noise: standard deviation of the Gaussian noise on both clouds, unit-sphere units.
       noise_clip: largest noise per coordinate, unit-sphere units (RPM-Net's jitter).
       max_rotation_deg: the pose's rotation angle is uniform up to here, about a uniform axis.
@@ -87,12 +88,17 @@ class PairSampling:
         unit-sphere units.
     """
 
-    num_reference: int = 1024
-    num_source: int = 512
-    noise: float = 0.01
-    noise_clip: float = 0.05
-    max_rotation_deg: float = 45.0
-    max_translation: float = 0.5
+    num_reference: int = positive(1024)
+    num_source: int = not_negative(0)
+    noise: float = not_negative(0.01)
+    noise_clip: float = positive(0.05)
+    max_rotation_deg: float = not_negative(45.0)
+    max_translation: float = not_negative(0.5)
+
+    def fitted(self, scan_set: ScanSet) -> PairSampling:
+        """The same with as many rows as the sources of these scans need, where none are set."""
+        rows = self.num_source or int(source_sizes(scan_set, self.num_reference).max())
+        return PairSampling(**values_of(PairSampling, self) | {"num_source": rows})
 
 
 def source_sizes(scan_set: ScanSet, num_reference: int) -> np.ndarray:

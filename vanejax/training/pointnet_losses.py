@@ -7,9 +7,6 @@ most.
 
 from __future__ import annotations
 
-import dataclasses
-import math
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -20,14 +17,15 @@ from vanejax.matching.baselines.pointnetlk import PointNetLK
 from vanejax.matching.metrics import nearest_offsets, pose_metrics
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
+from vanejax.settings import Settings, factor, not_negative, positive, settings_class
 from vanejax.training import loss_terms as losses
-from vanejax.training.gradient_accumulation import accumulate
+from vanejax.training.gradient_sums import mean_over_pairs
 from vanejax.training.pairs import Pair
 from vanejax.training.train_step import Metrics, Variables
 
 
-@dataclasses.dataclass(frozen=True)
-class PointNetLKLoss:
+@settings_class
+class PointNetLKLoss(Settings):
     """A `vanejax.training.train_step.Loss` for PointNetLK.
 
     Published: the matrix loss after the last iteration, with gradients through all of them, and in
@@ -39,15 +37,14 @@ class PointNetLKLoss:
       discount: weight of an iteration relative to the next; 0 leaves the last alone.
       matrix: factor of `matrix_loss`; 1 as published.
       residual: factor of the mean square of the features' residual.
-      pairs_at_once: pairs of a batch that are computed side by side. It should divide the batch,
-        and changes rounding only.
+      pairs_at_once: see `mean_over_pairs`.
     """
 
-    iterations: int = 10
-    discount: float = 0.5
-    matrix: float = 1.0
-    residual: float = 0.0
-    pairs_at_once: int = 1
+    iterations: int = positive(10)
+    discount: float = not_negative(0.5)
+    matrix: float = factor(1.0)
+    residual: float = factor(0.0)
+    pairs_at_once: int = positive(1)
 
     def __call__(
         self, model: PointNetLK, variables: Variables, pairs: Pair
@@ -73,11 +70,13 @@ class PointNetLKLoss:
                 parts["residual"] = jnp.mean(steps.residual**2, axis=-1)
             return _of_iterations(self, parts, poses, truth)
 
-        return _mean_over_pairs(of_pair, (variables, template), pairs, self.pairs_at_once)
+        return mean_over_pairs(
+            of_pair, (variables, template), pairs, pairs_at_once=self.pairs_at_once
+        )
 
 
-@dataclasses.dataclass(frozen=True)
-class PcrNetLoss:
+@settings_class
+class PcrNetLoss(Settings):
     """A `vanejax.training.train_step.Loss` for PCRNet.
 
     Published: the earth mover's distance between the moved source and the template, or Chamfer's,
@@ -90,14 +89,14 @@ class PcrNetLoss:
       discount: weight of an iteration relative to the next; 0 leaves the last alone.
       pose: factor of `losses.pose_loss`; 0 as published.
       chamfer: factor of `chamfer_loss`.
-      pairs_at_once: see `PointNetLKLoss`.
+      pairs_at_once: see `mean_over_pairs`.
     """
 
-    iterations: int = 8
-    discount: float = 0.5
-    pose: float = 1.0
-    chamfer: float = 0.0
-    pairs_at_once: int = 1
+    iterations: int = positive(8)
+    discount: float = not_negative(0.5)
+    pose: float = factor(1.0)
+    chamfer: float = factor(0.0)
+    pairs_at_once: int = positive(1)
 
     def __call__(
         self, model: PcrNet, variables: Variables, pairs: Pair
@@ -122,7 +121,9 @@ class PcrNetLoss:
                 parts["chamfer"] = chamfer(poses, source, pairs.target)
             return _of_iterations(self, parts, poses, truth)
 
-        return _mean_over_pairs(of_pair, (variables, template), pairs, self.pairs_at_once)
+        return mean_over_pairs(
+            of_pair, (variables, template), pairs, pairs_at_once=self.pairs_at_once
+        )
 
 
 def matrix_loss(found: RigidTransform, truth: RigidTransform) -> jax.Array:
@@ -156,27 +157,3 @@ def _of_iterations(
     total = jnp.sum(loss.discount**last * per_iteration)
     pose = jax.tree.map(lambda leaf: leaf[-1], poses)
     return total, {name: value[-1] for name, value in parts.items()} | pose_metrics(pose, truth)
-
-
-def _mean_over_pairs(
-    of_pair: Callable[[Any, PointCloud, RigidTransform], tuple[jax.Array, Metrics]],
-    shared: Any,
-    pairs: Pair,
-    pairs_at_once: int,
-) -> tuple[jax.Array, Metrics]:
-    """Mean of ``of_pair(shared, source, truth)``, differentiable in ``shared``."""
-    batch = pairs.source.mask.shape[0]
-    at_once = math.gcd(batch, pairs_at_once)
-
-    def some_pairs(
-        shared: Any, carry: tuple[()], some: tuple
-    ) -> tuple[jax.Array, tuple[()], Metrics]:
-        totals, metrics = jax.vmap(of_pair, in_axes=(None, 0, 0))(shared, *some)
-        return jnp.sum(totals), carry, metrics
-
-    some = jax.tree.map(
-        lambda leaf: leaf.reshape(batch // at_once, at_once, *leaf.shape[1:]),
-        (pairs.source, pairs.target_from_source),
-    )
-    total, _, metrics = accumulate(some_pairs, shared, (), some)
-    return total / batch, jax.tree.map(jnp.mean, metrics)

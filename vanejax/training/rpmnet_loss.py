@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from typing import Any
 
 import jax
@@ -14,14 +12,15 @@ from vanejax.matching.metrics import pose_metrics
 from vanejax.matching.rpmnet import Match, RpmNet
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
+from vanejax.settings import Settings, factor, not_negative, positive, settings_class
 from vanejax.training import loss_terms as losses
-from vanejax.training.gradient_accumulation import accumulate
+from vanejax.training.gradient_sums import mean_over_pairs, sum_with_gradient
 from vanejax.training.pairs import Pair
 from vanejax.training.train_step import Metrics, Variables
 
 
-@dataclasses.dataclass(frozen=True)
-class RpmNetLoss:
+@settings_class
+class RpmNetLoss(Settings):
     """A `vanejax.training.train_step.Loss` for RPM-Net.
 
     Attributes:
@@ -32,18 +31,17 @@ class RpmNetLoss:
       matching: factor of `losses.matching_loss`; 0 as published.
       matching_sigma: its width, unit-sphere units.
       partner: factor of `losses.partner_loss`; 0 as published.
-      pairs_at_once: pairs of a batch that are computed side by side: 1 suits the caches of a CPU,
-        the whole batch a GPU. It should divide the batch, and changes rounding only.
+      pairs_at_once: see `mean_over_pairs`.
     """
 
-    iterations: int = 2
-    discount: float = 0.5
-    pose: float = 1.0
-    inlier: float = 0.01
-    matching: float = 0.0
-    matching_sigma: float = 0.04
-    partner: float = 0.0
-    pairs_at_once: int = 1
+    iterations: int = positive(2)
+    discount: float = not_negative(0.5)
+    pose: float = factor(1.0)
+    inlier: float = not_negative(0.01)
+    matching: float = factor(0.0)
+    matching_sigma: float = positive(0.04)
+    partner: float = factor(0.0)
+    pairs_at_once: int = positive(1)
 
     def of_match(self, match: Match, source: Any, pair: Pair) -> tuple[jax.Array, Metrics]:
         """Loss [] of one iteration for one pair, and its parts."""
@@ -88,23 +86,9 @@ class RpmNetLoss:
 
             # the published network does not differentiate through the pose either
             init = jax.tree.map(jnp.asarray, RigidTransform.identity())
-            total, _, metrics = accumulate(iteration, shared, init, weights)
+            total, _, metrics = sum_with_gradient(iteration, shared, init, weights)
             return total, jax.tree.map(lambda leaf: leaf[-1], metrics)
 
-        def some_pairs(
-            shared: tuple[Variables, jax.Array], carry: tuple[()], some: tuple
-        ) -> tuple[jax.Array, tuple[()], Metrics]:
-            if at_once == 1:
-                total, metrics = of_pair(shared, *jax.tree.map(lambda leaf: leaf[0], some))
-                return total, carry, metrics
-            totals, metrics = jax.vmap(of_pair, in_axes=(None, 0, 0))(shared, *some)
-            return jnp.sum(totals), carry, metrics
-
-        batch = pairs.source.mask.shape[0]
-        at_once = math.gcd(batch, self.pairs_at_once)
-        some = jax.tree.map(
-            lambda leaf: leaf.reshape(batch // at_once, at_once, *leaf.shape[1:]),
-            (pairs.source, pairs.target_from_source),
+        return mean_over_pairs(
+            of_pair, (variables, features), pairs, pairs_at_once=self.pairs_at_once
         )
-        total, _, metrics = accumulate(some_pairs, (variables, features), (), some)
-        return total / batch, jax.tree.map(jnp.mean, metrics)

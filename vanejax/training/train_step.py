@@ -17,6 +17,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from vanejax.rigid import RigidTransform
+from vanejax.settings import Settings, not_negative, positive, settings_class
 from vanejax.training.pairs import Bank, Pair, PairSampling
 
 Metrics = dict[str, jax.Array]
@@ -53,24 +54,38 @@ class Loss(Protocol):
         ...
 
 
-def make_optimizer(
-    *,
-    learning_rate: float,
-    steps: int,
-    warmup_steps: int,
-    clip_norm: float,
-    final_fraction: float = 0.0,
-) -> optax.GradientTransformation:
-    """Adam with warm-up, cosine decay to ``final_fraction`` of the peak, and norm clipping."""
+@settings_class
+class OptimizerSettings(Settings):
+    """Adam with warm-up, cosine decay and clipped gradients.
+
+    Attributes:
+      steps: of the optimizer.
+      learning_rate: peak of Adam's.
+      warmup_steps: linear growth from 0 to the peak.
+      final_fraction: of the peak, at the end of the cosine decay.
+      clip_norm: largest global norm of a gradient.
+    """
+
+    steps: int = positive(5000)
+    learning_rate: float = positive(1e-3)
+    warmup_steps: int = not_negative(100)
+    final_fraction: float = not_negative(0.0)
+    clip_norm: float = positive(1.0)
+
+
+def make_optimizer(settings: OptimizerSettings) -> optax.GradientTransformation:
+    """Adam as its settings say."""
     schedule = optax.warmup_cosine_decay_schedule(
         init_value=0.0,
-        peak_value=learning_rate,
-        warmup_steps=warmup_steps,
-        decay_steps=max(steps, warmup_steps + 1),
-        end_value=final_fraction * learning_rate,
+        peak_value=settings.learning_rate,
+        warmup_steps=settings.warmup_steps,
+        decay_steps=max(settings.steps, settings.warmup_steps + 1),
+        end_value=settings.final_fraction * settings.learning_rate,
     )
     # flat: some dozens of leaves would be updated, and compiled, one by one
-    return optax.flatten(optax.chain(optax.clip_by_global_norm(clip_norm), optax.adam(schedule)))
+    return optax.flatten(
+        optax.chain(optax.clip_by_global_norm(settings.clip_norm), optax.adam(schedule))
+    )
 
 
 def init_state(

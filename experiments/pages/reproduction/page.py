@@ -17,9 +17,8 @@ from matplotlib.image import imread
 
 from experiments.pages.reproduction.claim import Verdict
 from experiments.pages.reproduction.document import TITLE, Document, Folded, Part, Picture
-from experiments.runner.machine import cores, cpu_model
+from experiments.runner.machine import cores, cpu_model, git_commit
 from experiments.runner.markdown import slug
-from experiments.runner.run_folder import git_commit
 
 PICTURE_DPI = 110
 _FOLDER = Path(__file__).parent

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.pages.reproduction.studies import INPUTS, Outcome, Study
-from experiments.runner.run_folder import git_commit
+from experiments.runner.machine import git_commit
 from vanejax.errors import InputError
 from vanejax.files import read_json, write_json
 

@@ -3,13 +3,14 @@
 Every field can be overridden on the command line: ``--config.icp.max_distance=0.1``.
 """
 
-# No ``from __future__ import annotations`` here: the command line reads the fields' types.
+from __future__ import annotations
+
 import copy
-import dataclasses
 from dataclasses import field
 
 from experiments.runner.experiment import Experiment, TrainingSettings
 from vanejax.errors import InputError
+from vanejax.settings import Settings, settings_class
 
 CLASSICAL = ("icp", "sac_ia", "sac_ia_icp", "fgr")
 NETWORKS = ("dcp", "pointnetlk", "pcrnet", "rpmnet")
@@ -17,8 +18,8 @@ OPEN3D = ("open3d_icp", "open3d_ransac_icp", "open3d_fgr")
 METHODS = CLASSICAL + NETWORKS + OPEN3D
 
 
-@dataclasses.dataclass
-class IcpSettings:
+@settings_class
+class IcpSettings(Settings):
     """ICP's, ours and Open3D's; see `vanejax.matching.baselines.icp.icp`. Unit-sphere units."""
 
     metric: str = "point_to_plane"
@@ -29,8 +30,8 @@ class IcpSettings:
     trim: float = 1.0
 
 
-@dataclasses.dataclass
-class SacIaSettings:
+@settings_class
+class SacIaSettings(Settings):
     """SAC-IA's; see `vanejax.matching.baselines.sac_ia.sac_ia`. Lengths in unit-sphere units."""
 
     feature_radius: float = 0.3
@@ -39,8 +40,8 @@ class SacIaSettings:
     num_candidates: int = 3
 
 
-@dataclasses.dataclass
-class FgrSettings:
+@settings_class
+class FgrSettings(Settings):
     """FGR's; see `vanejax.matching.baselines.fgr.fgr`. Lengths in unit-sphere units."""
 
     feature_radius: float = 0.3
@@ -50,8 +51,8 @@ class FgrSettings:
     num_tuples: int = 1000
 
 
-@dataclasses.dataclass
-class Open3dRansacSettings:
+@settings_class
+class Open3dRansacSettings(Settings):
     """Open3D's RANSAC on FPFH; see `open3d_methods.ransac`. Unit-sphere units."""
 
     feature_radius: float = 0.3
@@ -59,8 +60,8 @@ class Open3dRansacSettings:
     num_hypotheses: int = 100_000
 
 
-@dataclasses.dataclass
-class Open3dFgrSettings:
+@settings_class
+class Open3dFgrSettings(Settings):
     """Open3D's FGR; see `open3d_methods.fgr`. Lengths in unit-sphere units."""
 
     feature_radius: float = 0.3
@@ -69,8 +70,8 @@ class Open3dFgrSettings:
     num_tuples: int = 1000
 
 
-@dataclasses.dataclass
-class TrainingOfNetworks:
+@settings_class
+class TrainingOfNetworks(Settings):
     """How each network is trained."""
 
     dcp: TrainingSettings = field(default_factory=TrainingSettings)
@@ -79,8 +80,8 @@ class TrainingOfNetworks:
     rpmnet: TrainingSettings = field(default_factory=TrainingSettings)
 
 
-@dataclasses.dataclass
-class Comparison:
+@settings_class
+class Comparison(Settings):
     """A comparison; a config file's ``get_config()`` returns it.
 
     Attributes:
@@ -115,7 +116,7 @@ class Comparison:
         experiment.training = copy.deepcopy(getattr(self.training, network))
         return experiment
 
-    def check(self) -> None:
+    def check(self, path: str = "config") -> None:
         """Refuses settings that cannot be run.
 
         Raises:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import datetime
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,12 +27,11 @@ from experiments.evaluate import registered
 from experiments.runner import study_command as study
 from experiments.runner.evaluation_report import hardest_views
 from experiments.runner.experiment import Experiment
-from experiments.runner.machine import cores, cpu_model
+from experiments.runner.machine import report_head
 from experiments.runner.registrations import Results
-from experiments.runner.run_folder import git_commit, versions
 from experiments.runner.trained import given_runs, trained
 from experiments.studies.comparison.table import training_line
-from experiments.train import exit_code, load_or_scan
+from experiments.train import load_or_scan
 from vanejax import plotting
 from vanejax.errors import InputError
 from vanejax.files import read_json
@@ -92,13 +90,7 @@ def public_vs_virtual(
         results[name] = registered(settings, scans, network.variables, progress=progress)
     report = {
         "name": config.name,
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "machine": {"cpu": cpu_model(), "cores": cores()},
-        "commit": git_commit(),
-        "versions": versions(),
-        "part": {"name": part.name, "sha256": part.sha256},
-        "seed": config.seed,
-        "config": dataclasses.asdict(config),
+        **report_head(part, seed=config.seed, config=dataclasses.asdict(config)),
         "trained_on": sources,
     } | compared(results, scans.test)
     report = study.save(workdir, "public_vs_virtual", report)
@@ -184,7 +176,6 @@ def table(report: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main(config: Experiment, workdir: Path, words: list[str]) -> int:
-    """Compares; the exit code."""
-    runs = given_runs(words, (PUBLIC, VIRTUAL))
-    return exit_code(lambda: public_vs_virtual(config, workdir, runs), workdir)
+def main(config: Experiment, workdir: Path, words: list[str]) -> None:
+    """Compares, with the runs of the command line."""
+    public_vs_virtual(config, workdir, given_runs(words, (PUBLIC, VIRTUAL)))

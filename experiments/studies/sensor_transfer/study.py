@@ -25,11 +25,9 @@ from experiments.runner import study_command as study
 from experiments.runner.experiment import (
     DataSettings,
     Experiment,
-    LossSettings,
     PartSettings,
     TrainingSettings,
 )
-from experiments.runner.online import EndlessSettings
 from experiments.runner.run_folder import RunFolder
 from experiments.runner.vane_views import perturb
 from experiments.studies.real_scans.study import RIGHT_DEG, RIGHT_MM, Known, load_truth
@@ -46,6 +44,8 @@ from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.measured_scan import MeasuredScan
 from vanejax.scans.scan_file import load_scan
 from vanejax.training.export import export_workdir
+from vanejax.training.online_scans import OnlineScans
+from vanejax.training.rpmnet_loss import RpmNetLoss
 from vanejax.training.weight_file import TrainedMatcher
 
 START_DEG, START_SHARE = 45.0, 0.5  # of the part's radius
@@ -56,13 +56,13 @@ _STARTS = 0x7247  # folded into the seed
 
 
 def recipe(known: Known, sensor: str, *, effects: bool, steps: int, seed: int) -> Experiment:
-    """The training for one part; only ``endless.effects`` tells two of them apart."""
+    """The training for one part; only ``online.effects`` tells two of them apart."""
     return Experiment(
         name=f"{known.cad.stem}_{sensor if effects else IDEAL}",
         seed=seed,
         part=PartSettings(path=str(known.cad), units=known.cad_units),
         data=DataSettings(num_reference=512),
-        endless=EndlessSettings(
+        online=OnlineScans(
             sensor=sensor,
             distance_mm=DISTANCES_MM,
             elevation_deg=(-90.0, 90.0),
@@ -70,7 +70,7 @@ def recipe(known: Known, sensor: str, *, effects: bool, steps: int, seed: int) -
             # as many pixels as the depth camera has
             resolution=min(1.0, 424 / preset(sensor).camera.width),
         ),
-        loss=LossSettings(matching=0.02, matching_sigma=0.02),
+        loss=RpmNetLoss(matching=0.02, matching_sigma=0.02),
         training=TrainingSettings(steps=steps, learning_rate=2e-3, quick_compilation=False),
     )
 

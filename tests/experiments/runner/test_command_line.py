@@ -3,13 +3,17 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from absl import flags
 
 from experiments.configs import smoke, table1
+from experiments.runner import command_line
 from experiments.runner.command_line import resolve_config, workdir
+from experiments.runner.experiment import Experiment
 from vanejax.errors import InputError
 
 ROOT = Path(__file__).parents[3]
@@ -29,6 +33,26 @@ def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]
         text=True,
         timeout=120,
     )
+
+
+@pytest.fixture
+def command(monkeypatch) -> Callable[..., int]:
+    """A command with ``--config`` and ``--workdir`` in this process: its exit code."""
+
+    def run_here(*arguments: str, main: Callable[[Experiment], object] = Experiment.check) -> int:
+        before = set(flags.FLAGS)
+        config, _ = command_line.define_config(), command_line.define_workdir()
+        monkeypatch.setattr(sys, "argv", ["train", *arguments])
+        try:
+            with pytest.raises(SystemExit) as left:
+                command_line.run(lambda: main(config.value))
+        finally:
+            for name in set(flags.FLAGS) - before:
+                delattr(flags.FLAGS, name)
+            flags.FLAGS.unparse_flags()
+        return left.value.code
+
+    return run_here
 
 
 def test_a_bare_name_is_found_here_first_and_then_in_the_package(tmp_path, monkeypatch) -> None:
@@ -58,17 +82,25 @@ def test_an_unknown_config_lists_those_there_are() -> None:
         (["--config", "smoke.py", "--config.model=16"], ["is a group", "num_neighbors"]),
         (
             ["--config", "smoke.py", "--config.model.num_neighbors=abc"],
-            ["config.model.num_neighbors=abc", "it takes an int, for example 32"],
+            ["config.model.num_neighbors=abc", "it takes an int, for example 8"],
         ),
         (["--config", "smoke.py", "--wrokdir=x"], ["wrokdir", "workdir"]),
         (["--config", "smoke.py", "--config.data.noise=-1"], ["config.data.noise=-1.0", ">= 0"]),
-        (["--config", "smoke.py", "--config.part.path=none.stl"], ["none.stl"]),
         (["--config", "smoke.py", "stray"], ["stray"]),
         (
             ["--config", "smoke.py", "--config.model.name=pointnet"],
             ["config.model.name='pointnet'", "did you mean pointnetlk?", "dcp", "pcrnet"],
         ),
         (["--config", "smoke.py", "--config.dcp.heads=3"], ["dcp.width=512", "dcp.heads=3"]),
+        (["--config", "smoke.py", "--config.loss.pose=0", "--config.loss.matching=0"], ["all 0"]),
+        (["--config", "smoke.py", "--config.training.average_decay=1"], ["lie in [0, 1)"]),
+        (["--config", "smoke.py", "--config.model.feature_width=12"], ["multiple of 8"]),
+        (["--config", "smoke.py", "--config.online.sensor=hawk"], ["no sensor 'hawk'"]),
+        (["--config", "smoke.py", "--config.online.castings=0"], ["castings=0 must be positive"]),
+        (
+            ["--config=vane_robust.py", "--config.data.shapes=solids"],
+            ["config.data.shapes='solids'", "config.online.sensor", "train on one of them"],
+        ),
         (
             ["--config", "smoke.py", "--config.pointnetlk.origin=mean"],
             ["pointnetlk.origin='mean'", "means, target"],
@@ -77,13 +109,69 @@ def test_an_unknown_config_lists_those_there_are() -> None:
     ],
 )
 def test_a_wrong_command_line_is_one_clear_error(
-    arguments: list[str], words: list[str], tmp_path
+    arguments: list[str], words: list[str], command, capsys
 ) -> None:
-    done = run(*arguments, "--workdir", str(tmp_path / "run"))
-    assert done.returncode == 2
-    assert "Traceback" not in done.stderr
+    assert command(*arguments) == 2
+    text = capsys.readouterr().err
+    assert text.startswith("error: ")
+    assert text.count("\n") == 1
     for word in words:
-        assert word in done.stderr
+        assert word in text
+
+
+def test_overrides_reach_every_group_of_the_tree(command) -> None:
+    configs = []
+    code = command(
+        "--config",
+        "smoke.py",
+        "--config.model.num_neighbors=16",
+        "--config.dcp.loss.matching=0.3",
+        "--config.pcrnet.head=(8,4)",
+        "--config.online.distance_mm=(200,300)",
+        "--config.training.quick_compilation=false",
+        main=configs.append,
+    )
+    assert code == 0
+    expected = smoke.get_config()
+    expected.model.num_neighbors, expected.dcp.loss.matching = 16, 0.3
+    expected.pcrnet.head, expected.online.distance_mm = (8, 4), (200, 300)
+    expected.training.quick_compilation = False
+    assert configs == [expected]
+
+
+LOSS = """
+from experiments.configs import smoke
+from vanejax.settings import factor, settings_class
+from vanejax.training.rpmnet_loss import RpmNetLoss
+
+
+@settings_class
+class MyLoss(RpmNetLoss):
+    sharpness: float = factor(0.0)
+
+    def of_match(self, match, source, pair):
+        value, parts = super().of_match(match, source, pair)
+        parts["sharpness"] = 1 / match.beta
+        return value + self.sharpness * parts["sharpness"], parts
+
+
+def get_config():
+    config = smoke.get_config()
+    config.loss = MyLoss(sharpness=0.1)
+    return config
+"""
+
+
+def test_a_loss_of_a_config_file_has_fields_on_the_command_line(command, tmp_path, capsys) -> None:
+    path, configs = tmp_path / "mine.py", []
+    path.write_text(LOSS)
+    assert command(f"--config={path}", "--config.loss.sharpness=0.2", main=configs.append) == 0
+    assert configs[0].make_network().loss.sharpness == 0.2
+    assert command(f"--config={path}", "--config.loss.sharpness=-1") == 2
+    assert "config.loss.sharpness=-1.0 must be >= 0" in capsys.readouterr().err
+    path.write_text(LOSS.replace("config.loss =", "config.lost ="))
+    assert command(f"--config={path}") == 2
+    assert "Experiment has no field 'lost'; did you mean loss?" in capsys.readouterr().err
 
 
 def test_another_network_has_a_folder_of_its_own() -> None:
@@ -107,8 +195,9 @@ def test_help_names_the_config_and_the_workdir() -> None:
 
 def test_compiled_programs_are_kept_where_the_user_says(tmp_path) -> None:
     cache, workdir = tmp_path / "cache", str(tmp_path / "run")
-    wrong = ["--config", "smoke.py", "--config.data.noise=-1", "--workdir", workdir]
-    assert run(*wrong, VANEJAX_CACHE_DIR=str(cache)).returncode == 2
-    assert cache.is_dir()  # made before the settings were looked at
-    assert run(*wrong, VANEJAX_CACHE_DIR="off", XDG_CACHE_HOME=str(tmp_path)).returncode == 2
-    assert not (tmp_path / "vanejax").exists()
+    wrong = ["--config", "smoke.py", "--config.part.path=none.stl", "--workdir", workdir]
+    done = run(*wrong, VANEJAX_CACHE_DIR=str(cache))
+    assert done.returncode == 2
+    assert "none.stl" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert cache.is_dir()

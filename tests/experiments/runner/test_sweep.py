@@ -22,7 +22,7 @@ from vanejax.errors import InputError
     ],
 )
 def test_values_have_the_type_of_their_field(word: str, values: tuple) -> None:
-    (sweep,) = parse_sweeps([word])
+    (sweep,) = parse_sweeps([word], get_config())
     assert sweep.values == values
     types = [type(value) for value in values]
     assert [type(value) for value in sweep.values] == types
@@ -54,7 +54,7 @@ def test_values_have_the_type_of_their_field(word: str, values: tuple) -> None:
 )
 def test_a_wrong_sweep_says_what_is_wrong(words: list[str], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        parse_sweeps(words)
+        parse_sweeps(words, get_config())
 
 
 def test_seeds_are_whole_numbers_each_once() -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.runner.online import EndlessSettings
 from experiments.studies.sensor_transfer import study as sensor_transfer
 from experiments.studies.sensor_transfer.study import (
     IDEAL,
@@ -25,6 +24,7 @@ from vanejax.scanner.measurement import measure
 from vanejax.scanner.sensor import preset
 from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.scan_file import save_points
+from vanejax.training.online_scans import OnlineScans
 from vanejax.training.pretrained import pretrained_matcher
 
 
@@ -62,8 +62,8 @@ def test_a_good_network_and_a_bad_one_are_told_apart(
     asked = []
 
     def network(config, place):
-        asked.append((config.endless.effects, place))
-        return good if config.endless.effects else bad
+        asked.append((config.online.effects, place))
+        return good if config.online.effects else bad
 
     monkeypatch.setattr(sensor_transfer, "network", network)
     arguments = [str(folder), "--out", str(tmp_path), "--starts", "3", "--steps", "7"]
@@ -102,15 +102,15 @@ def test_two_trainings_differ_in_the_effects_alone(folder: Path) -> None:
     )
     real.check()
     assert (real.name, ideal.name) == ("part_consumer_depth", "part_ideal")
-    assert (real.endless.effects, ideal.endless.effects) == (True, False)
-    ideal.name, ideal.endless = real.name, dataclasses.replace(ideal.endless, effects=True)
+    assert (real.online.effects, ideal.online.effects) == (True, False)
+    ideal.name, ideal.online = real.name, dataclasses.replace(ideal.online, effects=True)
     assert ideal == real
-    assert real.endless.resolution == 1.0  # its own pixels
+    assert real.online.resolution == 1.0  # its own pixels
 
 
 def test_no_effects_leave_the_camera_and_nothing_of_the_sensor() -> None:
-    settings = EndlessSettings(sensor="consumer_depth", effects=False)
-    sensor, full = settings.kind(), preset("consumer_depth")
+    settings = OnlineScans(sensor="consumer_depth", effects=False)
+    sensor, full = settings.make_sensor(), preset("consumer_depth")
     assert sensor.camera == full.camera
     part = guide_vane()
     pose = hemisphere_viewpoints(part.center).view(3)
@@ -118,7 +118,7 @@ def test_no_effects_leave_the_camera_and_nothing_of_the_sensor() -> None:
     measured = measure(Scanner(part), sensor, pose, rng)
     ideal = Scanner(part).scan(full.camera, pose)
     np.testing.assert_array_equal(measured.points, ideal.points)
-    assert EndlessSettings(sensor="consumer_depth").kind() == full
+    assert OnlineScans(sensor="consumer_depth").make_sensor() == full
 
 
 def test_a_sensor_that_is_none_is_refused(folder: Path, capsys) -> None:

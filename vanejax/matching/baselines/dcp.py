@@ -87,7 +87,7 @@ class DcpSettings(Settings):
             )
 
 
-class Dcp(DcpSettings, nn.Module):
+class Dcp(nn.Module, DcpSettings):
     """DCP for one pair; `jax.vmap` over pairs. Its fields are `DcpSettings`."""
 
     def setup(self) -> None:

@@ -45,7 +45,7 @@ class PcrNetSettings(Settings):
     )
 
 
-class PcrNet(PcrNetSettings, nn.Module):
+class PcrNet(nn.Module, PcrNetSettings):
     """PCRNet for one pair; `jax.vmap` over pairs. Its fields are `PcrNetSettings`.
 
     The pose is held constant between iterations when gradients are taken. The dropout that is

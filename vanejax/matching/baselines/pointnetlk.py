@@ -80,7 +80,7 @@ class PointNetLKSettings(Settings):
     origin: str = one_of("means", "target")
 
 
-class PointNetLK(PointNetLKSettings, nn.Module):
+class PointNetLK(nn.Module, PointNetLKSettings):
     """PointNetLK for one pair; `jax.vmap` over pairs. Its fields are `PointNetLKSettings`.
 
     The pose is held constant between iterations when gradients are taken, as in RPM-Net; the

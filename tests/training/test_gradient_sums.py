@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vanejax.training.gradient_accumulation import accumulate
+from vanejax.training.gradient_sums import sum_with_gradient
 
 EXACT = 1e-6  # f32 eps x 10
 
@@ -35,7 +35,7 @@ def arguments():
 
 
 def test_values_carry_and_aux_are_those_of_the_loop(arguments):
-    total, carry, aux = jax.jit(lambda *a: accumulate(body, *a))(*arguments)
+    total, carry, aux = jax.jit(lambda *a: sum_with_gradient(body, *a))(*arguments)
     expected = plain(*arguments)
     np.testing.assert_allclose(total, expected[0], atol=EXACT)
     np.testing.assert_allclose(carry, expected[1], atol=EXACT)
@@ -50,7 +50,7 @@ def test_the_gradient_is_that_of_the_loop_in_reverse(arguments):
         return jnp.tanh(0.1 * total), aux
 
     (value, aux), found = jax.jit(
-        jax.value_and_grad(lambda s: loss(lambda *a: accumulate(body, *a), s), has_aux=True)
+        jax.value_and_grad(lambda s: loss(lambda *a: sum_with_gradient(body, *a), s), has_aux=True)
     )(arguments[0])
     (expected, twice), gradient = jax.value_and_grad(lambda s: loss(plain, s), has_aux=True)(
         arguments[0]
@@ -65,11 +65,13 @@ def test_loops_nest_and_batch(arguments):
     shared, carry, xs = arguments
 
     def pair(shared, carry, x):
-        total, _, aux = accumulate(body, shared, carry, jnp.stack([x, 2 * x]))
+        total, _, aux = sum_with_gradient(body, shared, carry, jnp.stack([x, 2 * x]))
         return total, carry, aux["twice"]
 
     def batch(shared):
-        totals = jax.vmap(lambda x: accumulate(pair, shared, carry, jnp.stack([x, x + 1]))[0])(xs)
+        totals = jax.vmap(
+            lambda x: sum_with_gradient(pair, shared, carry, jnp.stack([x, x + 1]))[0]
+        )(xs)
         return jnp.sum(totals * jnp.arange(1.0, 5.0))
 
     def slow(shared):
@@ -85,5 +87,7 @@ def test_loops_nest_and_batch(arguments):
 
 def test_only_what_is_shared_is_differentiated(arguments):
     shared, carry, xs = arguments
-    gradient = jax.jit(jax.grad(lambda c, x: accumulate(body, shared, c, x)[0], (0, 1)))(carry, xs)
+    gradient = jax.jit(jax.grad(lambda c, x: sum_with_gradient(body, shared, c, x)[0], (0, 1)))(
+        carry, xs
+    )
     assert not any(np.any(leaf) for leaf in gradient)

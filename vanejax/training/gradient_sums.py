@@ -1,8 +1,9 @@
-"""Sums over a loop whose gradient is taken while it runs forward."""
+"""Sums and means of losses whose gradients are taken while the loop runs forward."""
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -10,11 +11,16 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+from vanejax.training.pairs import Pair
+
 Body = Callable[[Any, Any, Any], tuple[jax.Array, Any, Any]]
+OfPair = Callable[[Any, PointCloud, RigidTransform], tuple[jax.Array, dict[str, jax.Array]]]
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def accumulate(body: Body, shared: Any, carry: Any, xs: Any) -> tuple[jax.Array, Any, Any]:
+def sum_with_gradient(body: Body, shared: Any, carry: Any, xs: Any) -> tuple[jax.Array, Any, Any]:
     """Sums ``value`` of ``value, carry, aux = body(shared, carry, x)`` over the leading axis of xs.
 
     As `jax.lax.scan`, but differentiable in ``shared`` alone: carry and xs count as constants.
@@ -69,4 +75,34 @@ def _backward(body: Body, saved: tuple, cotangents: tuple) -> tuple:
     return unflatten(scale * gradient), None, None
 
 
-accumulate.defvjp(_forward, _backward)
+sum_with_gradient.defvjp(_forward, _backward)
+
+
+def mean_over_pairs(
+    of_pair: OfPair, shared: Any, pairs: Pair, *, pairs_at_once: int = 1
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Mean loss [] and mean metrics [] over a batch that shares its target.
+
+    Args:
+      of_pair: ``value, metrics = of_pair(shared, source, target_from_source)`` for one pair.
+      shared: what the mean is differentiable in; see `sum_with_gradient`.
+      pairs: sources and labels [B].
+      pairs_at_once: pairs of the batch that are computed side by side: 1 suits the caches of a
+        CPU, the whole batch a GPU. It should divide the batch, and changes rounding only.
+    """
+    batch = pairs.source.mask.shape[0]
+    at_once = math.gcd(batch, pairs_at_once)
+
+    def of_group(shared: Any, carry: tuple[()], group: tuple) -> tuple[jax.Array, tuple[()], Any]:
+        if at_once == 1:
+            value, metrics = of_pair(shared, *jax.tree.map(lambda leaf: leaf[0], group))
+            return value, carry, metrics
+        values, metrics = jax.vmap(of_pair, in_axes=(None, 0, 0))(shared, *group)
+        return jnp.sum(values), carry, metrics
+
+    groups = jax.tree.map(
+        lambda leaf: leaf.reshape(batch // at_once, at_once, *leaf.shape[1:]),
+        (pairs.source, pairs.target_from_source),
+    )
+    total, _, metrics = sum_with_gradient(of_group, shared, (), groups)
+    return total / batch, jax.tree.map(jnp.mean, metrics)
