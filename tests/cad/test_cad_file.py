@@ -157,6 +157,7 @@ ASCII = encoded("stl_ascii").decode()
         ("a.ply", POINTS_ONLY.replace("vertex 1", "vertex 9" + "0" * 15) + "end_header\n", "trunc"),
         ("a.obj", TEXT, "a.obj: "),
         ("a.obj", "v 0 0 0\nv 1 0 0\n", "a.obj: "),
+        ("a.obj", "v 0\nv 1\nv 2\nf 1 2 3\n", "a vertex is not three numbers"),
         ("a.glb", TEXT, "a.glb: is no readable"),
         ("a.glb", encoded("glb")[:-40], "a.glb: is no readable"),
         ("a.glb", glb_with(no_view), "promises"),

@@ -160,6 +160,8 @@ def _scene_triangles(data: bytes, path: Path, suffix: str) -> tuple[np.ndarray, 
             if cloud
             else f"{path}: holds no triangles; export the solid body"
         )
+    if any(np.shape(mesh.vertices)[1:] != (3,) for _, mesh in meshes):
+        raise InputError(f"{path}: damaged: a vertex is not three numbers; export it again")
     faces = sum(len(mesh.faces) for _, mesh in meshes)
     if faces > MAX_FACES:
         raise InputError(
