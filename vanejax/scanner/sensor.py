@@ -120,6 +120,11 @@ class Sensor:
             changes["lens"] = dataclasses.replace(self.lens, center_error_px=center_error_px)
         return dataclasses.replace(self, camera=camera, **changes)
 
+    def only(self, *names: str) -> Sensor:
+        """The same camera with the effects of these fields alone; an ideal one without any."""
+        kept = ("camera", "baseline_mm", "jump_mm", "correlation_px", *names)
+        return Sensor(**{name: getattr(self, name) for name in kept})
+
     def exposed_for(self, distance_mm: float) -> Sensor:
         """The same with the exposure that a part at this distance needs.
 

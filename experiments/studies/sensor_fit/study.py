@@ -150,17 +150,6 @@ def measured_by(scans: Sequence[RealScan], sensor: Sensor, seed: int) -> list[Co
     return result
 
 
-def alone(full: Sensor, effect: str) -> Sensor:
-    """An ideal camera with one effect of a sensor."""
-    ideal = Sensor(
-        camera=full.camera,
-        baseline_mm=full.baseline_mm,
-        jump_mm=full.jump_mm,
-        correlation_px=full.correlation_px,
-    )
-    return dataclasses.replace(ideal, **{name: getattr(full, name) for name in EFFECTS[effect]})
-
-
 def without(full: Sensor, effect: str) -> Sensor:
     """A sensor less one of its effects."""
     return dataclasses.replace(full, **{name: getattr(Sensor(), name) for name in EFFECTS[effect]})
@@ -223,10 +212,9 @@ def measure(
 
     Distances are to the real scans: of all, and of those half of them that were not fitted to.
     """
-    ideal = dataclasses.replace(Sensor(), camera=full.camera)
-    made = {"ideal": measured_by(scans, ideal, seed)}
+    made = {"ideal": measured_by(scans, full.only(), seed)}
     for effect in EFFECTS:
-        made[f"+ {effect}"] = measured_by(scans, alone(full, effect), seed)
+        made[f"+ {effect}"] = measured_by(scans, full.only(*EFFECTS[effect]), seed)
     made["all"] = measured_by(scans, full, seed)
     for effect in EFFECTS:
         made[f"all but {effect}"] = measured_by(scans, without(full, effect), seed)

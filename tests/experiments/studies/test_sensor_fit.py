@@ -182,7 +182,7 @@ def test_the_gap_of_residuals_is_between_0_and_1():
 def test_effects_alone_and_left_out_are_those_of_the_sensor():
     full = dataclasses.replace(consumer_depth(), camera=CAMERA)
     for effect, names in sensor_fit.EFFECTS.items():
-        one, rest = sensor_fit.alone(full, effect), sensor_fit.without(full, effect)
+        one, rest = full.only(*names), sensor_fit.without(full, effect)
         for other, others in sensor_fit.EFFECTS.items():
             for name in others:
                 has, lacks = (one, rest) if other == effect else (rest, one)
