@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
+from experiments.runner import markdown
 from vanejax.plotting.canvas import FAINT, INK, REFERENCE_RED, new_figure, style_chart
 from vanejax.plotting.charts import SERIES
 
@@ -21,7 +22,7 @@ PAPER = {"turns": (0.142, 0.32), "moves": (0.692, 0.85)}  # mean and maximum, Fi
 GOAL = {"turns": 0.05, "moves": 0.1}  # mean, registration and calibration included
 STATUSES = ("accepted", "ambiguous", "rejected")
 
-# what is told of turns and of moves: name in the rows, words, unit
+# figures of turns and of moves: name in the rows, words, unit
 TURNS = {
     "error_deg": ("angle about the R axis", "deg"),
     "whole_deg": ("the whole rotation", "deg"),
@@ -80,11 +81,11 @@ def table(report: Report) -> str:
     verdicts = Counter(row["verdict"] for camera in cameras for row in singles_of(camera))
     count = sum(verdicts.values())
     seconds = [row["seconds"] for camera in cameras for row in singles_of(camera)]
-    told = ", ".join(f"{verdicts[status]} {status}" for status in STATUSES)
+    outcome = ", ".join(f"{verdicts[status]} {status}" for status in STATUSES)
     blocks = [
-        _headline(report),
+        _summary_table(report),
         f"Cameras of the kind `{report['sensor']}`: {len(cameras)}; positions turned and moved to: "
-        f"{report['positions']} each; {count} registrations ({report['method']}): {told}; "
+        f"{report['positions']} each; {count} registrations ({report['method']}): {outcome}; "
         f"{np.median(seconds):.2f} s each (median).",
         _details(report),
         _predictions(report),
@@ -96,27 +97,30 @@ def table(report: Report) -> str:
     return "\n\n".join(blocks)
 
 
-def _headline(report: Report) -> str:
+def _summary_table(report: Report) -> str:
     met = is_met(report)
-    lines = [
-        "| error, mean (maximum) | paper | here | goal for the mean | |",
-        "|---|---|---|---|---|",
-    ]
+    rows = []
     for name, words, unit, rows_of, figure in (
         ("turns", "rotation angle", "deg", turns_of, "error_deg"),
         ("moves", "translation", "mm", moves_of, "against_probe_mm"),
     ):
         values = magnitudes(report, rows_of, figure)
-        paper = PAPER[name]
-        lines.append(
-            f"| {words} ({unit}) | {paper[0]:g} ({paper[1]:g}) | {values.mean():.3f} "
-            f"({values.max():.3f}) | {GOAL[name]:g} | {'met' if met[name] else 'MISSED'} |"
+        rows.append(
+            [
+                f"{words} ({unit})",
+                f"{PAPER[name][0]:g} ({PAPER[name][1]:g})",
+                f"{values.mean():.3f} ({values.max():.3f})",
+                f"{GOAL[name]:g}",
+                "met" if met[name] else "MISSED",
+            ]
         )
-    return "\n".join(lines)
+    return markdown.table(
+        ["error, mean (maximum)", "paper", "here", "goal for the mean", "goal"], rows
+    )
 
 
 def _details(report: Report) -> str:
-    lines = ["| error | mean | maximum | means of the cameras |", "|---|---|---|---|"]
+    rows = []
     for title, rows_of, figures in (
         ("turned: ", turns_of, TURNS),
         ("moved: ", moves_of, MOVES),
@@ -125,19 +129,15 @@ def _details(report: Report) -> str:
         for name, (words, unit) in figures.items():
             values = magnitudes(report, rows_of, name)
             means = values.mean(axis=1)
-            lines.append(
-                f"| {title}{words} ({unit}) | {values.mean():.4f} | {values.max():.4f} | "
-                f"{means.min():.4f} to {means.max():.4f} |"
-            )
+            means_range = f"{means.min():.4f} to {means.max():.4f}"
+            row = [f"{title}{words} ({unit})", f"{values.mean():.4f}", f"{values.max():.4f}"]
+            rows.append([*row, means_range])
     away = np.mean([camera["machine_mm"] for camera in report["cameras"]])
-    return "\n".join(
-        [
-            *lines,
-            "",
-            f"Eq. 13's translation is that of the machine's origin, {away / 1000:.1f} m from the "
-            "part: the registration's rotation error times that lever. All other figures are taken "
-            "at the part's centre.",
-        ]
+    return (
+        markdown.table(["error", "mean", "maximum", "means of the cameras"], rows)
+        + f"\n\nEq. 13's translation is that of the machine's origin, {away / 1000:.1f} m from the "
+        "part: the registration's rotation error times that lever. All other figures are taken "
+        "at the part's centre."
     )
 
 
@@ -146,63 +146,52 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _predictions(report: Report) -> str:
-    lines = [
-        "| root mean square | error | predicted from the scan's noise | with the camera's own "
-        "calibration |",
-        "|---|---|---|---|",
+    predicted = [
+        [words, *(f"{_rms(magnitudes(report, rows_of, name)):.4f}" for name in names)]
+        for words, rows_of, names in (
+            ("angle (deg)", turns_of, ("error_deg", "sigma_noise_deg", "sigma_deg")),
+            (
+                "translation against the truth (mm)",
+                moves_of,
+                ("against_truth_mm", "sigma_noise_mm", "sigma_mm"),
+            ),
+        )
     ]
-    for words, rows_of, error, noise, both in (
-        ("angle (deg)", turns_of, "error_deg", "sigma_noise_deg", "sigma_deg"),
-        ("translation against the truth (mm)", moves_of, "against_truth_mm", "sigma_noise_mm",
-         "sigma_mm"),
-    ):  # fmt: skip
-        cells = [f"{_rms(magnitudes(report, rows_of, name)):.4f}" for name in (error, noise, both)]
-        lines.append(f"| {words} | " + " | ".join(cells) + " |")
-    lines += [
-        "",
-        "| what the camera's own calibration does, predicted | to one pose | to a motion |",
-        "|---|---|---|",
-    ]
+    head = ["root mean square", "error", "predicted from the scan's noise"]
+    noise = markdown.table([*head, "with the camera's own calibration"], predicted)
+    rows = []
     for kind in ("turns", "moves"):
         shares = [camera["bias"][kind] for camera in report["cameras"]]
         for unit in ("deg", "mm"):
-            pose, motion = (
-                _rms(np.array([share[f"{what}_{unit}"] for share in shares]))
-                for what in ("pose", "motion")
-            )
-            lines.append(f"| {kind} ({unit}) | {pose:.4f} | {motion:.4f} |")
-    return "\n".join(lines)
+            parts = [
+                _rms(np.array([share[f"{part}_{unit}"] for share in shares]))
+                for part in ("pose", "motion")
+            ]
+            rows.append([f"{kind} ({unit})", *(f"{value:.4f}" for value in parts)])
+    head = ["what the camera's own calibration does, predicted", "to one pose", "to a motion"]
+    return f"{noise}\n\n{markdown.table(head, rows)}"
 
 
 def _frames(report: Report) -> str:
-    lines = [
-        "| camera to machine, mean of the cameras | rotation (deg) | at the cubes (mm) | predicted "
-        "(deg) | (mm) | left over (deg) | (mm) |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    figures = ("rotation_deg", "translation_mm", "sigma_deg", "sigma_mm", "left_deg", "left_mm")
+    rows = []
     for name, words in (
         ("joint", "all planes of 8 placements at once"),
         ("mean", "mean of 8 matrices (the paper's way)"),
     ):
-        rows = [camera["calibration"][name] for camera in report["cameras"]]
-        cells = [
-            f"{np.mean([row[figure] for row in rows]):.4f}"
-            for figure in (
-                "rotation_deg", "translation_mm", "sigma_deg", "sigma_mm", "left_deg", "left_mm"
-            )
-        ]  # fmt: skip
-        lines.append(f"| {words} | " + " | ".join(cells) + " |")
+        found = [camera["calibration"][name] for camera in report["cameras"]]
+        means = [np.mean([row[figure] for row in found]) for figure in figures]
+        rows.append([words, *(f"{mean:.4f}" for mean in means)])
     joint = [camera["calibration"]["joint"] for camera in report["cameras"]]
     bias = {
         unit: _rms(np.array([row[f"bias_sigma_{unit}"] for row in joint])) for unit in ("deg", "mm")
     }
-    return "\n".join(
-        [
-            *lines,
-            "",
-            "Predicted is without the camera's own calibration, whose share of the error is "
-            f"{bias['deg']:.4f} deg and {bias['mm']:.4f} mm (one standard deviation).",
-        ]
+    head = ["camera to machine, mean of the cameras", "rotation (deg)", "at the cubes (mm)"]
+    head += ["predicted (deg)", "(mm)", "left over (deg)", "(mm)"]
+    return (
+        markdown.table(head, rows)
+        + "\n\nPredicted is without the camera's own calibration, whose share of the error is "
+        f"{bias['deg']:.4f} deg and {bias['mm']:.4f} mm (one standard deviation)."
     )
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.optimize import minimize
 
+from experiments.runner import markdown
 from experiments.runner import study_command as study
 from experiments.studies.real_scans.study import load_truth
 from experiments.studies.sensor_fit.sensor_statistics import (
@@ -245,30 +246,30 @@ def measure(
 
 def table(report: Mapping[str, Any]) -> str:
     """Figures of real and virtual scans side by side, as Markdown; then the distances."""
-    virtual = report["virtual"]
+    virtual, real = report["virtual"], report["real"]
     shown = [name for name in virtual if not name.startswith("all but")]
-    lines = [
-        "| figure | real | " + " | ".join(shown) + " |",
-        "|---|---|" + "---|" * len(shown),
+    rows = [
+        [
+            figure,
+            _cell(figure, value),
+            *(_cell(figure, virtual[name]["statistics"][figure]) for name in shown),
+        ]
+        for figure, value in real["statistics"].items()
     ]
-    for figure, value in report["real"]["statistics"].items():
-        cells = [value, *(virtual[name]["statistics"][figure] for name in shown)]
-        lines.append(f"| {figure} | " + " | ".join(_cell(figure, cell) for cell in cells) + " |")
     for title, key, halves_key in (
         ("**distance, all scans**", "distance", "distance_of_halves"),
         ("**distance, scans not fitted to**", "distance_held_out", None),
         ("**Kolmogorov-Smirnov, residuals**", "residual_gap", "residual_gap_of_halves"),
     ):
-        halves_cell = f"(halves: {report['real'][halves_key]:.2f})" if halves_key else ""
-        cells = [f"{virtual[name][key]:.2f}" for name in shown]
-        lines.append(f"| {title} | {halves_cell} | " + " | ".join(cells) + " |")
+        of_halves = f"(halves: {real[halves_key]:.2f})" if halves_key else ""
+        rows.append([title, of_halves, *(f"{virtual[name][key]:.2f}" for name in shown)])
     left = ", ".join(
         f"{name.removeprefix('all but ')} {row['distance']:.2f}"
         for name, row in virtual.items()
         if name.startswith("all but")
     )
-    lines += ["", f"The distance with all effects but one: {left}."]
-    return "\n".join(lines)
+    text = markdown.table(["figure", "real", *shown], rows)
+    return f"{text}\n\nThe distance with all effects but one: {left}."
 
 
 def _cell(figure: str, value: float | None) -> str:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from experiments.runner import markdown
 from experiments.runner import study_command as study
 from experiments.runner.experiment import (
     DataSettings,
@@ -160,22 +161,25 @@ def summarize(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str,
 
 def table(report: dict[str, Any]) -> str:
     """Markdown: a row for each way to train, for all scans and for those of each part."""
-    lines = [
-        "| network trained on | part | by it: right | deg | mm | refined: right | deg | mm |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    rows = []
     for part, summary in report["summary"].items():
         for name, stages in summary.items():
-            cells = [name, part]
-            for stage in ("alone", "refined"):
-                found = stages[stage]
-                cells += [
-                    f"{round(found['right'] * found['registrations'])} of {found['registrations']}",
-                    f"{found['rotation_deg']:.2f}",
-                    f"{found['translation_mm']:.2f}",
-                ]
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+            rows.append([name, part])
+            for stage in (stages["alone"], stages["refined"]):
+                right = round(stage["right"] * stage["registrations"])
+                rows[-1] += [f"{right} of {stage['registrations']}"]
+                rows[-1] += [f"{stage[error]:.2f}" for error in ("rotation_deg", "translation_mm")]
+    head = [
+        "network trained on",
+        "part",
+        "by it: right",
+        "deg",
+        "mm",
+        "refined: right",
+        "deg",
+        "mm",
+    ]
+    return markdown.table(head, rows)
 
 
 def sensor_name(text: str) -> str:
