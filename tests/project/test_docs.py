@@ -167,8 +167,9 @@ def folder(tmp_path, monkeypatch) -> Path:
     """Where the configs and the example of a page lie."""
     monkeypatch.chdir(tmp_path)
     text = (ROOT / "docs" / "adding_a_method.md").read_text()
-    (config,) = [code for _, code in blocks(text, "python") if "get_config" in code]
-    (tmp_path / "my_vane.py").write_text(config)
+    for _, code in blocks(text, "python"):
+        if name := re.match(r"# (my_\w+\.py)\n", code):
+            (tmp_path / name[1]).write_text(code)
     return tmp_path
 
 
@@ -442,7 +443,7 @@ def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     space: dict[str, object] = {"__name__": name}
     for _, code in blocks((ROOT / "docs" / f"{name}.md").read_text(), "python"):
-        exec(compile(code, f"{name}.md", "exec"), space)
+        exec(compile(code, f"{name}.md", "exec", dont_inherit=True), space)
 
 
 def test_the_method_of_the_page_keeps_the_contract() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from absl import flags
 
@@ -15,6 +16,10 @@ from experiments.runner import command_line
 from experiments.runner.command_line import resolve_config, workdir
 from experiments.runner.experiment import Experiment
 from vanejax.errors import InputError
+from vanejax.pointcloud import PointCloud
+from vanejax.rigid import RigidTransform
+from vanejax.training.pairs import Pair
+from vanejax.training.rpmnet_loss import RpmNetLoss
 
 ROOT = Path(__file__).parents[3]
 
@@ -139,37 +144,28 @@ def test_overrides_reach_every_group_of_the_tree(command) -> None:
     assert configs == [expected]
 
 
-LOSS = """
-from experiments.configs import smoke
-from vanejax.settings import factor, settings_class
-from vanejax.training.rpmnet_loss import RpmNetLoss
-
-
-@settings_class
-class MyLoss(RpmNetLoss):
-    sharpness: float = factor(0.0)
-
-    def of_match(self, match, source, pair):
-        value, parts = super().of_match(match, source, pair)
-        parts["sharpness"] = 1 / match.beta
-        return value + self.sharpness * parts["sharpness"], parts
-
-
-def get_config():
-    config = smoke.get_config()
-    config.loss = MyLoss(sharpness=0.1)
-    return config
-"""
-
-
-def test_a_loss_of_a_config_file_has_fields_on_the_command_line(command, tmp_path, capsys) -> None:
-    path, configs = tmp_path / "mine.py", []
-    path.write_text(LOSS)
-    assert command(f"--config={path}", "--config.loss.sharpness=0.2", main=configs.append) == 0
-    assert configs[0].make_network().loss.sharpness == 0.2
+def test_a_loss_needs_one_file_that_a_config_names(command, tmp_path, capsys) -> None:
+    """The example of docs/adding_a_method.md: on the command line, checked, and in the step."""
+    page = (ROOT / "docs" / "adding_a_method.md").read_text()
+    code = page.partition("```python\n# my_loss.py\n")[2].partition("```")[0]
+    path, configs = tmp_path / "my_loss.py", []
+    path.write_text(code)
+    assert command(f"--config={path}", "--config.loss.sharpness=0.5", main=configs.append) == 0
+    loss = configs[0].make_network().loss
+    match = SimpleNamespace(
+        target_from_source=RigidTransform.identity(),
+        log_assignment=np.zeros((3, 3), np.float32),
+        beta=4.0,
+    )
+    cloud = PointCloud.create(np.eye(3, dtype=np.float32), np.eye(3, dtype=np.float32))
+    pair = Pair(cloud, cloud, RigidTransform.identity())
+    total, parts = loss.of_match(match, cloud, pair)
+    rest, _ = RpmNetLoss(matching=0.02, matching_sigma=0.02).of_match(match, cloud, pair)
+    assert parts["sharpness"] == 0.25
+    np.testing.assert_allclose(total - rest, 0.5 * 0.25, rtol=1e-5)  # f32
     assert command(f"--config={path}", "--config.loss.sharpness=-1") == 2
     assert "config.loss.sharpness=-1.0 must be >= 0" in capsys.readouterr().err
-    path.write_text(LOSS.replace("config.loss =", "config.lost ="))
+    path.write_text(code.replace("config.loss =", "config.lost ="))
     assert command(f"--config={path}") == 2
     assert "Experiment has no field 'lost'; did you mean loss?" in capsys.readouterr().err
 
