@@ -182,6 +182,39 @@ def read_arrays(
     return arrays, header
 
 
+def read_versioned_arrays(
+    path: str | os.PathLike[str], file_format: str, version: int, *, words: str, remedy: str
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """`read_arrays` of a file of vanejax's own format, which its header names.
+
+    Args:
+      path: the file.
+      file_format, version: that its header must have.
+      words: for messages, what the file should be, such as "a scan set".
+      remedy: for messages, what to do about another file.
+
+    Raises:
+      InputError: no such file, no file, damaged, or of another format or version.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file (looked in {path.parent.absolute()})")
+    if not path.is_file():
+        raise InputError(f"{path}: is a folder or a device, not {words}")
+    try:
+        arrays, header = read_arrays(path)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: truncated or not {words} ({error}); {remedy}") from error
+    if header.get("format") != file_format:
+        raise InputError(f"{path}: not {words} of vanejax; {remedy}")
+    if header.get("version") != version:
+        raise InputError(
+            f"{path}: {words} of version {header.get('version')!r}, this program reads {version}; "
+            f"{remedy}"
+        )
+    return arrays, header
+
+
 def arrays_sha256(arrays: Mapping[str, np.ndarray]) -> str:
     """A digest of names, dtypes, shapes and contents of arrays."""
     digest = hashlib.sha256()

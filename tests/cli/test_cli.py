@@ -217,7 +217,7 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
         (["register", "scan.ply", "wedge.stl", "--init", "mirror.json"], "mirror image"),
         (["register", "scan.ply", "wedge.stl", "--init", "none.json"], "none.json: no such file"),
         (["register", "scan.ply", "wedge.stl", "--weights", "none.npz"], "none.npz: no such file"),
-        (["register", "scan.ply", "wedge.stl", "--weights", "text.docx"], "no weights"),
+        (["register", "scan.ply", "wedge.stl", "--weights", "text.docx"], "not a weights file"),
         (["register", "scan.ply", "wedge.stl", "--sensor-origin", "here"], "here: should be X,Y,Z"),
         (["register", "scan.ply", "wedge.stl", "--sensor-origin", "1,2"], "should be X,Y,Z"),
         (["register", "scan.ply", "wedge.stl", "--sensor-origin", "1,2,nan"], "should be X,Y,Z"),

@@ -191,7 +191,7 @@ def test_arrays_that_are_no_scan(tmp_path):
     np.savez(tmp_path / "b.npz", header=np.zeros(7, np.uint8))
     found = check(inspect(tmp_path / "b.npz"))
     assert found.kind == "arrays"
-    assert "no weights of vanejax" in found.notes[-1]
+    assert "not a weights file of vanejax" in found.notes[-1]
 
 
 def test_a_pose(tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -22,9 +21,6 @@ from experiments.runner.run_folder import RunFolder
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.files import read_arrays, write_arrays
-from vanejax.matching.rpmnet import RpmNet
-from vanejax.pointcloud import PointCloud
-from vanejax.training import weight_file
 from vanejax.training.checkpoint import Checkpoints
 from vanejax.training.dataset import ScanSet, make_scan_set
 from vanejax.training.export import export_workdir
@@ -34,7 +30,6 @@ from vanejax.training.weight_file import (
     abstract_variables,
     load_model,
     save_model,
-    weights_by_name,
 )
 
 
@@ -102,11 +97,8 @@ def matcher(exported: Path) -> TrainedMatcher:
 
 
 def assert_same_weights(found: Any, wanted: Any) -> None:
-    one, other = weights_by_name(found), weights_by_name(wanted)
-    assert one.keys() == other.keys()
-    assert len(one) == 52
-    for name, value in one.items():
-        np.testing.assert_array_equal(value, other[name], err_msg=name)
+    assert len(jax.tree.leaves(found)) == 52
+    jax.tree.map(np.testing.assert_array_equal, found, wanted)
 
 
 def test_an_export_holds_the_run(
@@ -127,44 +119,20 @@ def test_an_export_holds_the_run(
     matcher.check_part(part)
 
 
-@pytest.mark.parametrize(
-    ("which", "theirs", "step"), [("best", "best", 10), ("last", "latest", 20)]
-)
-def test_the_weights_are_those_that_evaluate_takes(
-    workdir: Path, tmp_path: Path, config, scans, which: str, theirs: str, step: int
+def test_the_weights_are_those_that_evaluate_takes_and_the_run_is_only_read(
+    workdir: Path, tmp_path: Path, config, scans, matcher: TrainedMatcher
 ) -> None:
-    written = export_workdir(workdir, tmp_path / "vane.safetensors", checkpoint=which)
-    found = load_model(tmp_path / "vane.safetensors")
-    assert found.trained["step"] == written.trained["step"] == step
-    assert_same_weights(found.variables, load_variables(config, scans, workdir, which=theirs))
-
-
-def test_an_export_only_reads_the_run(workdir: Path, tmp_path: Path) -> None:
     def look() -> dict[Path, int]:
         return {path: path.stat().st_mtime_ns for path in workdir.rglob("*") if path.is_file()}
 
     before = look()
-    export_workdir(workdir, tmp_path / "vane.safetensors")
+    export_workdir(workdir, tmp_path / "vane.safetensors", checkpoint="last")
     assert look() == before
     assert [path.name for path in tmp_path.iterdir()] == ["vane.safetensors"]
-
-
-def test_what_is_loaded_computes_what_the_run_does(
-    matcher: TrainedMatcher, config: Experiment, scans: ScanSet, workdir: Path
-) -> None:
-    xyz = ((matcher.reference_points - matcher.center) / matcher.radius_mm)[:100]
-    cloud = PointCloud.create(
-        jnp.asarray(xyz, jnp.float32), jnp.asarray(matcher.reference_normals[:100])
-    )
-
-    @functools.partial(jax.jit, static_argnums=0)
-    def features(model: RpmNet, variables: Any) -> jax.Array:
-        return model.apply(variables, cloud, method="features")
-
-    variables = load_variables(config, scans, workdir, which="best")
-    found = features(matcher.model, matcher.variables)
-    np.testing.assert_array_equal(found, features(config.make_network().model, variables))
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-5)  # f32
+    last = load_model(tmp_path / "vane.safetensors")
+    for found, which, step in ((matcher, "best", 10), (last, "latest", 20)):
+        assert found.trained["step"] == step
+        assert_same_weights(found.variables, load_variables(config, scans, workdir, which=which))
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
@@ -220,17 +188,20 @@ BIAS = "params/feature_net/prepool_0/dense/bias"
         (set_array(KERNEL, lambda x: x.astype(np.float64)), f"{KERNEL} is float64"),
         (set_array(BIAS, lambda x: x * np.nan), f"{BIAS} holds values that are not finite"),
         (set_array("reference_points", lambda x: x[:, :2]), "should both be"),
-        (set_array("reference_normals", lambda x: x.astype(np.float16)), "not float32"),
+        (
+            set_array("reference_normals", lambda x: x.astype(np.float16)),
+            "reference_normals is float16",
+        ),
         (
             lambda arrays, header: arrays.update(
                 {name: arrays[name][:100] for name in ("reference_points", "reference_normals")}
             ),
             "100 reference points, fewer than the 256",
         ),
-        (lambda arrays, header: header.clear(), "no weights of vanejax"),
-        (set_header("format", to="other"), "no weights of vanejax"),
-        (set_header("version", to=2), "version 2, this program reads 1"),
-        (set_header("camera", to=None), "header has no camera"),
+        (lambda arrays, header: header.clear(), "not a weights file of vanejax"),
+        (set_header("format", to="other"), "not a weights file of vanejax"),
+        (set_header("version", to=2), "of version 2, this program reads 1"),
+        (set_header("camera", to=None), "should have .*'camera'"),
         (set_header("camera", "width", to=-5), "camera: camera width"),
         (set_header("model", "feature_width", to=10**12), "feature_width=10+ should be int"),
         (set_header("model", "feature_width", to=33), "feature_width=33 is no multiple of 8"),
@@ -241,9 +212,9 @@ BIAS = "params/feature_net/prepool_0/dense/bias"
         (set_header("drawing", "noise", to="0.1"), "noise='0.1' should be float"),
         (set_header("iterations", to=0), "iterations=0 should be int, from 1"),
         (set_header("voxel_mm", to=float("nan")), "voxel_mm=nan"),
-        (set_header("part", to=[]), "center_mm=None"),
+        (set_header("part", to=[]), r"part: has \[\], should have"),
         (set_header("part", "center_mm", to=[0, 0, "1"]), "center_mm='1'"),
-        (set_header("part", "sha256", to=5), "name and sha256 should be text"),
+        (set_header("part", "sha256", to=5), "sha256=5 should be of type str"),
     ],
 )
 def test_a_changed_file_is_refused_by_what_changed(
@@ -269,22 +240,18 @@ def test_a_file_cut_off_or_of_another_kind_is_refused(
     damaged[len(whole) // 2] ^= 1
     for content in (b"", b"hello", whole[:100], whole[: len(whole) // 2], whole[:-1], damaged):
         path.write_bytes(content)
-        with pytest.raises(InputError, match=r"bad\..*: truncated or no weights"):
+        with pytest.raises(InputError, match=r"bad\..*: truncated or not a weights file"):
             load_model(path)
     write_arrays(path, {"a": np.zeros(3)}, {})
-    with pytest.raises(InputError, match="no weights of vanejax"):
+    with pytest.raises(InputError, match="not a weights file of vanejax"):
         load_model(path)
 
 
-def test_what_is_no_file_is_refused(tmp_path: Path, monkeypatch) -> None:
+def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         load_model(tmp_path / "none.npz")
     with pytest.raises(InputError, match="is a folder"):
         load_model(tmp_path)
-    monkeypatch.setattr(weight_file, "MAX_BYTES", 2)
-    (tmp_path / "a.safetensors").write_text("abc")
-    with pytest.raises(InputError, match="too large"):
-        load_model(tmp_path / "a.safetensors")
 
 
 def test_what_cannot_be_loaded_is_not_saved(matcher: TrainedMatcher, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.files import read_arrays, write_arrays
+from vanejax.files import read_versioned_arrays, write_arrays
 from vanejax.pointcloud import voxel_thin
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, Viewpoints
@@ -183,15 +183,11 @@ def load_scan_set(
       InputError: no such file, not a scan set, another version, truncated, changed, or stale.
     """
     path = Path(path)
-    try:
-        arrays, header = read_arrays(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: truncated or not a scan set ({error}); delete it and scan again"
-        ) from error
-    _check_header(header, path)
+    arrays, header = read_versioned_arrays(
+        path, FORMAT, VERSION, words="a scan set", remedy="delete it and scan again"
+    )
+    if missing := {"radius_mm", "source", "sha256"} - set(header):
+        raise InputError(f"{path}: its header has no {', '.join(sorted(missing))}")
     for key, value in (expected or {}).items():
         if header["source"].get(key) != value:
             raise InputError(
@@ -199,17 +195,6 @@ def load_scan_set(
                 "delete it or choose another folder"
             )
     return _from_arrays(arrays, header, path)
-
-
-def _check_header(header: Mapping[str, Any], path: Path) -> None:
-    wanted = {"format", "version", "radius_mm", "source", "sha256"}
-    if not wanted <= set(header) or header["format"] != FORMAT:
-        raise InputError(f"{path}: not a scan set of vanejax")
-    if header["version"] != VERSION:
-        raise InputError(
-            f"{path}: scan set version {header['version']}, this program reads {VERSION}; "
-            "delete it and scan again"
-        )
 
 
 def _from_arrays(arrays: dict[str, np.ndarray], header: dict[str, Any], path: Path) -> ScanSet:

@@ -52,9 +52,14 @@ def export_workdir(
             f"{workdir}: no such folder; give the work folder of a training run, or a checkpoint"
         )
     record = workdir / "run.json"
-    run = _read_run(record)
+    if not record.exists():
+        raise InputError(f"{record}: no such file; {workdir} is no training run")
+    run = _read_object(record)
+    part = run.get("part")
+    if not isinstance(part, dict) or not isinstance(run.get("config"), dict):
+        raise InputError(f"{record}: does not say which config and part the run is of")
     scans = load_scan_set(workdir / "scans.npz")
-    hashes = run["part"]["sha256"], str(scans.source.get("part_sha256"))
+    hashes = str(part.get("sha256")), str(scans.source.get("part_sha256"))
     if hashes[0] != hashes[1]:
         raise InputError(
             f"{workdir}: run.json is about the part {hashes[0][:12]}, scans.npz about "
@@ -78,6 +83,10 @@ def export_workdir(
             f"{workdir}: run.json or scans.npz has no {error}; another version wrote it"
         ) from error
     variables, step = _read_weights(workdir, model, checkpoint)
+    evaluation = None  # the run's own figures on its test views
+    if (figures := workdir / "evaluation.json").exists():
+        names, values = ("views", "summary", "date"), _read_object(figures)
+        evaluation = {name: values[name] for name in names if name in values}
     matcher = TrainedMatcher(
         model=model,
         variables=variables,
@@ -88,24 +97,16 @@ def export_workdir(
         radius_mm=scans.radius_mm,
         reference_points=scans.reference_points,
         reference_normals=scans.reference_normals,
-        part_name=run["part"]["name"],
-        part_sha256=run["part"]["sha256"],
+        part_name=part.get("name"),
+        part_sha256=hashes[0],
         camera=camera,
         trained={"step": step, "checkpoint": checkpoint}
         | {name: run.get(name) for name in ("versions", "commit", "started")}
         | {"experiment": config.get("name"), "seed": config.get("seed"), "config": config}
-        | {"evaluation": _evaluation(workdir / "evaluation.json")},
+        | {"evaluation": evaluation},
     )
     save_model(path, matcher)
     return matcher
-
-
-def _evaluation(path: Path) -> dict[str, Any] | None:
-    """The run's own figures on its test views; None before it was evaluated."""
-    if not path.exists():
-        return None
-    found = _read_object(path)
-    return {name: found[name] for name in ("views", "summary", "date") if name in found}
 
 
 def _sampling(data: dict[str, Any], scans: ScanSet) -> PairSampling:
@@ -135,17 +136,6 @@ def _read_weights(workdir: Path, model: RpmNet, checkpoint: Which) -> tuple[Any,
             raise InputError(f"{folder}: none was validated yet; take the last checkpoint")
         state = checkpoints.restore(like, step=step)
     return jax.tree.map(np.asarray, state.average), int(state.step)
-
-
-def _read_run(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        raise InputError(f"{path}: no such file; {path.parent} is no training run")
-    run = _read_object(path)
-    part = run.get("part")
-    known = isinstance(part, dict) and all(isinstance(part.get(n), str) for n in ("name", "sha256"))
-    if not known or not isinstance(run.get("config"), dict):
-        raise InputError(f"{path}: does not say which config and part the run is of")
-    return run
 
 
 def _read_object(path: Path) -> dict[str, Any]:

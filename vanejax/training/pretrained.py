@@ -11,18 +11,14 @@ from vanejax.training.weight_file import TrainedMatcher, load_model
 
 PRETRAINED = "pretrained"  # in place of a file's name
 _WORDS = (PRETRAINED, "shipped")  # the second is the word of older versions
-_FILES = ("guide_vane.safetensors",)
+_FILE = "pretrained_weights/guide_vane.safetensors"
 
 
 def pretrained_matcher(part: Part) -> TrainedMatcher | None:
     """The matcher that comes with the package for this part; None if there is none."""
-    folder = resources.files("vanejax.training") / "pretrained_weights"
-    for name in _FILES:
-        with resources.as_file(folder / name) as path:
-            matcher = load_model(path)
-        if matcher.knows(part):
-            return matcher
-    return None
+    with resources.as_file(resources.files("vanejax.training") / _FILE) as path:
+        matcher = load_model(path)
+    return matcher if matcher.knows(part) else None
 
 
 def find_weights(name: str | os.PathLike[str], part: Part) -> TrainedMatcher:

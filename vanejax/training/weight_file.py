@@ -10,7 +10,6 @@ import dataclasses
 import json
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,7 +19,7 @@ from scipy.spatial import cKDTree
 from vanejax.cad.nearest_face import NearestFace
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.files import read_arrays, write_arrays
+from vanejax.files import read_versioned_arrays, write_arrays
 from vanejax.matching.rpmnet import RpmNet
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
@@ -29,23 +28,35 @@ from vanejax.training.pairs import PairSampling
 
 FORMAT = "vanejax matcher"
 VERSION = 1
-MAX_BYTES = 1 << 28
 SAME_SURFACE = 1e-3  # of the radius: how far two files of one part may be apart
 
-# what a header may say: kind, smallest, largest; wide, but no network is beyond
+# what a header may hold: a number's kind, least and largest value, wide, but no network is beyond
 _MODEL = {
     "num_neighbors": (int, 1, 1024),
     "radius": (float, 1e-6, 100.0),
     "sinkhorn_iterations": (int, 1, 1000),
     "feature_width": (int, 8, 4096),
 }
-_SAMPLING = {
-    "num_reference": (int, 16, 1 << 22),
-    "num_source": (int, 16, 1 << 22),
-    "noise": (float, 0.0, 10.0),
-    "noise_clip": (float, 0.0, 10.0),
-    "max_rotation_deg": (float, 0.0, 180.0),
-    "max_translation": (float, 0.0, 100.0),
+_HEADER = {
+    "model": _MODEL,
+    "iterations": (int, 1, 1000),
+    "drawing": {  # of pairs: the fields of `PairSampling`
+        "num_reference": (int, 16, 1 << 22),
+        "num_source": (int, 16, 1 << 22),
+        "noise": (float, 0.0, 10.0),
+        "noise_clip": (float, 0.0, 10.0),
+        "max_rotation_deg": (float, 0.0, 180.0),
+        "max_translation": (float, 0.0, 100.0),
+    },
+    "voxel_mm": (float, 1e-6, 1e6),
+    "part": {
+        "name": str,
+        "sha256": str,
+        "center_mm": [(float, -1e9, 1e9)] * 3,
+        "radius_mm": (float, 1e-6, 1e9),
+    },
+    "camera": dict,
+    "trained": dict,
 }
 _REFERENCE = ("reference_points", "reference_normals")
 
@@ -125,7 +136,6 @@ def save_model(path: str | os.PathLike[str], matcher: TrainedMatcher) -> None:
     Raises:
       InputError: it cannot be written, or the matcher is not one that `load_model` would take.
     """
-    path = Path(path)
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -143,9 +153,9 @@ def save_model(path: str | os.PathLike[str], matcher: TrainedMatcher) -> None:
         "camera": matcher.camera.to_dict(),
         "trained": dict(matcher.trained),
     }
-    arrays = weights_by_name(matcher.variables)
+    arrays = {name: np.asarray(leaf) for name, leaf in _by_name(matcher.variables).items()}
     arrays |= {name: np.asarray(getattr(matcher, name)) for name in _REFERENCE}
-    _matcher(json.loads(json.dumps(header)), arrays, path)
+    _matcher(json.loads(json.dumps(header)), arrays, str(path))
     write_arrays(path, arrays, header)
 
 
@@ -156,36 +166,10 @@ def load_model(path: str | os.PathLike[str]) -> TrainedMatcher:
       InputError: no such file, truncated, of another kind or version, or arrays that are not those
         of the network that its header describes.
     """
-    path = Path(path)
-    if path.exists() and not path.is_file():
-        raise InputError(
-            f"{path}: is a folder or a device; `vanejax export` makes weights of a work folder"
-        )
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: is too large for weights of vanejax")
-        arrays, header = read_arrays(path)
-    except FileNotFoundError:
-        raise InputError(
-            f"{path}: no such file (looked in {path.parent.absolute()}); "
-            "`vanejax export WORKDIR` makes one"
-        ) from None
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: truncated or no weights of vanejax ({error}); export them again"
-        ) from error
-    _check_header(header, path)
-    return _matcher(header, arrays, path)
-
-
-def weights_by_name(variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The leaves of a tree of weights, named ``params/feature_net/prepool_0/dense/kernel``."""
-    return {
-        jax.tree_util.keystr(place, simple=True, separator="/"): np.asarray(leaf)
-        for place, leaf in jax.tree.leaves_with_path(variables)
-    }
+    arrays, header = read_versioned_arrays(
+        path, FORMAT, VERSION, words="a weights file", remedy="`vanejax export WORKDIR` makes them"
+    )
+    return _matcher(header, arrays, str(path))
 
 
 def abstract_variables(model: RpmNet) -> Any:
@@ -208,116 +192,100 @@ def model_from_dict(values: Any, where: str) -> RpmNet:
     Raises:
       InputError: a setting is missing, unknown or cannot be; the message starts with ``where``.
     """
-    settings = _fields(values, _MODEL, f"{where}, model")
+    settings = _checked(values, _MODEL, f"{where}: model")
     if settings["feature_width"] % 8:
         raise InputError(
-            f"{where}, model: feature_width={settings['feature_width']} is no multiple of 8"
+            f"{where}: model: feature_width={settings['feature_width']} is no multiple of 8"
         )
     return RpmNet(**settings)
 
 
-def _matcher(header: dict[str, Any], arrays: dict[str, np.ndarray], path: Path) -> TrainedMatcher:
-    """Checks everything that a header and arrays say, and puts it together."""
-    where = str(path)
-    model = model_from_dict(header["model"], where)
-    part = header["part"] if isinstance(header["part"], dict) else {}
-    center = part.get("center_mm")
-    if not isinstance(center, list) or len(center) != 3:
-        raise InputError(f"{where}, part: center_mm={center!r} should be three numbers")
-    names = {name: part.get(name) for name in ("name", "sha256")}
-    if not all(isinstance(value, str) for value in names.values()):
-        raise InputError(f"{where}, part: name and sha256 should be text, not {names}")
+def _matcher(header: dict[str, Any], arrays: dict[str, np.ndarray], where: str) -> TrainedMatcher:
+    """Checks everything that a header and arrays hold, and puts it together."""
+    values = _checked({name: header[name] for name in _HEADER if name in header}, _HEADER, where)
     try:
-        camera = Camera.from_dict(header["camera"])
+        camera = Camera.from_dict(values["camera"])
     except (InputError, TypeError, ValueError) as error:
-        raise InputError(f"{where}, camera: {error}") from error
-    matcher = TrainedMatcher(
-        model=model,
-        variables=_variables(model, arrays, where),
-        iterations=_number(header["iterations"], int, 1, 1000, f"{where}: iterations"),
-        sampling=PairSampling(**_fields(header["drawing"], _SAMPLING, f"{where}, drawing")),
-        voxel_mm=_number(header["voxel_mm"], float, 1e-6, 1e6, f"{where}: voxel_mm"),
-        center=np.array(
-            [_number(c, float, -1e9, 1e9, f"{where}, part: center_mm") for c in center]
-        ),
-        radius_mm=_number(part.get("radius_mm"), float, 1e-6, 1e9, f"{where}, part: radius_mm"),
-        reference_points=arrays["reference_points"],
-        reference_normals=arrays["reference_normals"],
-        part_name=names["name"],
-        part_sha256=names["sha256"],
-        camera=camera,
-        trained=header["trained"] if isinstance(header["trained"], dict) else {},
-    )
-    points, normals = matcher.reference_points, matcher.reference_normals
+        raise InputError(f"{where}: camera: {error}") from error
+    model = model_from_dict(values["model"], where)
+    variables = _variables(model, arrays, where)
+    points, normals = (arrays[name] for name in _REFERENCE)
     if points.shape != normals.shape or points.ndim != 2 or points.shape[1] != 3:
         raise InputError(
             f"{where}: reference_points {points.shape} and reference_normals {normals.shape} "
             "should both be [Y, 3]"
         )
-    if len(points) < matcher.sampling.num_reference:
+    sampling = PairSampling(**values["drawing"])
+    if len(points) < sampling.num_reference:
         raise InputError(
-            f"{where}: {len(points)} reference points, fewer than the "
-            f"{matcher.sampling.num_reference} that are to be drawn from them"
+            f"{where}: {len(points)} reference points, fewer than the {sampling.num_reference} "
+            "that are to be drawn from them"
         )
-    return matcher
+    part = values["part"]
+    return TrainedMatcher(
+        model=model,
+        variables=variables,
+        iterations=values["iterations"],
+        sampling=sampling,
+        voxel_mm=values["voxel_mm"],
+        center=np.array(part["center_mm"]),
+        radius_mm=part["radius_mm"],
+        reference_points=points,
+        reference_normals=normals,
+        part_name=part["name"],
+        part_sha256=part["sha256"],
+        camera=camera,
+        trained=values["trained"],
+    )
 
 
 def _variables(model: RpmNet, arrays: Mapping[str, np.ndarray], where: str) -> Any:
     """The tree of weights, after names, shapes, dtypes and values were checked."""
     abstract = abstract_variables(model)
-    wanted = {
-        jax.tree_util.keystr(place, simple=True, separator="/"): leaf
-        for place, leaf in jax.tree.leaves_with_path(abstract)
-    }
-    missing = sorted((set(wanted) | set(_REFERENCE)) - set(arrays))
-    extra = sorted(set(arrays) - set(wanted) - set(_REFERENCE))
-    if missing or extra:
-        told = [
-            f"{word} {', '.join(names[:5])}{' ...' if len(names) > 5 else ''}"
-            for word, names in (("missing:", missing), ("unknown:", extra))
-            if names
-        ]
-        raise InputError(f"{where}: not the arrays of this network; {'; '.join(told)}")
-    for name, leaf in wanted.items():
-        value = arrays[name]
-        if value.shape != leaf.shape or value.dtype != leaf.dtype:
-            raise InputError(
-                f"{where}: {name} is {value.dtype} {value.shape}, "
-                f"the network's is {leaf.dtype} {leaf.shape}"
-            )
+    expected = _by_name(abstract)
+    names = {*expected, *_REFERENCE}
+    if differing := sorted(names ^ set(arrays)):
+        listed = [f"{'missing' if name in names else 'unknown'}: {name}" for name in differing[:5]]
+        raise InputError(f"{where}: not the arrays of this network; {', '.join(listed)}")
     for name, value in arrays.items():
-        if value.dtype != np.float32:
-            raise InputError(f"{where}: {name} is {value.dtype}, not float32")
+        shape = expected[name].shape if name in expected else value.shape
+        dtype = np.dtype(np.float32)
+        if value.shape != shape or value.dtype != dtype:
+            raise InputError(
+                f"{where}: {name} is {value.dtype} {value.shape}, the network's is {dtype} {shape}"
+            )
         if not np.isfinite(value).all():
             raise InputError(f"{where}: {name} holds values that are not finite")
-    return jax.tree.unflatten(jax.tree.structure(abstract), [arrays[name] for name in wanted])
+    return jax.tree.unflatten(jax.tree.structure(abstract), [arrays[name] for name in expected])
 
 
-def _check_header(header: Mapping[str, Any], path: Path) -> None:
-    if header.get("format") != FORMAT:
-        raise InputError(f"{path}: no weights of vanejax; `vanejax export WORKDIR` makes them")
-    if header.get("version") != VERSION:
-        raise InputError(
-            f"{path}: weights of version {header.get('version')!r}, this program reads {VERSION}; "
-            "export them again"
-        )
-    wanted = {"model", "iterations", "drawing", "voxel_mm", "part", "camera", "trained"}
-    if missing := sorted(wanted - set(header)):
-        raise InputError(f"{path}: its header has no {', '.join(missing)}")
-
-
-def _fields(values: Any, limits: Mapping[str, tuple], where: str) -> dict[str, Any]:
-    """The numbers of a dict that must have exactly the names of ``limits``."""
-    names = set(values) if isinstance(values, dict) else set()
-    if names != set(limits):
-        raise InputError(f"{where}: has {sorted(names)}, should have {sorted(limits)}")
+def _by_name(tree: Any) -> dict[str, Any]:
+    """The leaves of a tree, named such as ``params/feature_net/prepool_0/dense/kernel``."""
     return {
-        name: _number(values[name], *limit, f"{where}: {name}") for name, limit in limits.items()
+        jax.tree_util.keystr(place, simple=True, separator="/"): leaf
+        for place, leaf in jax.tree.leaves_with_path(tree)
     }
 
 
-def _number(value: Any, kind: type, low: float, high: float, where: str) -> Any:
-    right = isinstance(value, int) if kind is int else isinstance(value, int | float)
-    if not right or isinstance(value, bool) or not low <= value <= high:
+def _checked(value: Any, schema: Any, where: str) -> Any:
+    """A value of JSON that is as the schema has it; whole numbers become floats where it says."""
+    if isinstance(schema, dict):
+        names = sorted(value) if isinstance(value, dict) else []
+        if names != sorted(schema):
+            raise InputError(f"{where}: has {names}, should have {sorted(schema)}")
+        return {
+            name: _checked(value[name], part, f"{where}: {name}") for name, part in schema.items()
+        }
+    if isinstance(schema, list):
+        if not isinstance(value, list) or len(value) != len(schema):
+            raise InputError(f"{where}={value!r} should be {len(schema)} numbers")
+        return [_checked(item, part, where) for item, part in zip(value, schema, strict=True)]
+    if isinstance(schema, type):
+        if not isinstance(value, schema):
+            raise InputError(f"{where}={value!r} should be of type {schema.__name__}")
+        return value
+    kind, low, high = schema
+    numbers = int if kind is int else int | float
+    if not isinstance(value, numbers) or isinstance(value, bool) or not low <= value <= high:
         raise InputError(f"{where}={value!r} should be {kind.__name__}, from {low:g} to {high:g}")
     return kind(value)
