@@ -120,20 +120,6 @@ def test_one_missing_triangle_is_filled_even_on_a_coarse_mesh():
     assert again.volume == pytest.approx(1e5, rel=1e-12)
 
 
-def test_cracked_bodies_are_united_too():
-    """Two overlapping boxes, each of two halves that meet without sharing vertices."""
-    cracked = []
-    for mesh in (box(), box((20, 20, 100))):
-        top = np.flatnonzero(mesh.face_normals[:, 2] > 0.5)
-        cracked.append(
-            trimesh.Trimesh(*trimesh.remesh.subdivide(mesh.vertices, mesh.faces, face_index=top))
-        )
-    solid, notes = repaired(*both(*cracked))
-    assert "closed 8 slits" in notes
-    assert "united 2 bodies" in notes
-    assert solid.volume == pytest.approx(1e5 + 4e4 - 8e3, rel=1e-6)
-
-
 def test_a_large_hole_is_refused_with_the_number_of_open_edges():
     mesh = box()
     top = mesh.face_normals[:, 2] > 0.5

@@ -97,9 +97,9 @@ def test_figures_do_not_depend_on_how_many_faces_are_taken_at_a_time(monkeypatch
     np.testing.assert_array_equal(np.concatenate(list(mesh.blocks())), mesh.corners())
 
 
-@pytest.mark.parametrize("block", [100, 10**6])
-def test_moments_of_the_surface_do_not_depend_on_it_either(monkeypatch, block):
-    monkeypatch.setattr(triangles, "BLOCK", block)
+@pytest.mark.slow
+def test_moments_of_the_surface_do_not_depend_on_it_either(monkeypatch):
+    monkeypatch.setattr(triangles, "BLOCK", 100)
     middle, axes = Surface(vane()).moments
     dense, _, _ = vane().sample(2_000_000, seed=3)
     np.testing.assert_allclose(middle, dense.mean(axis=0), atol=0.1)  # 40 mm / sqrt(2e6) x 4

@@ -245,17 +245,19 @@ def test_the_spacing_of_a_large_cloud_is_that_of_the_whole(tmp_path, monkeypatch
     assert inspect(tmp_path / "a.ply").spacing == pytest.approx(whole, rel=0.07)
 
 
-def test_weights(tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["w.npz", "w.safetensors"])
+def test_weights(tmp_path, monkeypatch, name):
     np.savez(tmp_path / "w.npz", header=np.zeros(7, np.uint8), kernel=np.zeros((2, 2)))
+    (tmp_path / "w.safetensors").write_bytes(b"\x02\0\0\0\0\0\0\0{}")
     sampling = SimpleNamespace(num_reference=1024, num_source=717)
     matcher = SimpleNamespace(
         part_name="vane", part_sha256="ab" * 32, radius_mm=75.0, sampling=sampling, iterations=5
     )
     monkeypatch.setattr("vanejax.training.weight_file.load_model", lambda path: matcher)
-    found = check(inspect(tmp_path / "w.npz"))
+    found = check(inspect(tmp_path / name))
     assert found.kind == "weights"
     assert found.notes == (
         "trained for the part vane (sha256 abababababab), radius 75 mm",
         "1,024 reference and up to 717 source points, 5 iterations",
     )
-    assert found.next_steps[0].endswith(f"--weights {tmp_path / 'w.npz'}")
+    assert found.next_steps[0].endswith(f"--weights {tmp_path / name}")

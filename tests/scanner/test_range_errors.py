@@ -90,12 +90,6 @@ def test_a_mixture_lies_between_both_sides_and_nearer_to_its_own():
     np.testing.assert_allclose(np.abs(added).mean(), 5.0, atol=0.4)  # uniform up to a half of 20
 
 
-def test_a_lens_without_error_shifts_nothing():
-    x, y = np.linspace(-0.4, 0.4, 5), np.linspace(-0.2, 0.2, 5)
-    for shift in Lens().shifts(x, y, fx=1600.0, fy=2100.0):
-        np.testing.assert_array_equal(shift, np.zeros(5))
-
-
 def test_lens_is_brown_s_model():
     x, y = np.array([0.3]), np.array([-0.2])
     lens = Lens(k1=0.02, k2=0.1, p1=1e-3, p2=2e-3, focal_error=1e-3, center_error_px=(0.5, 0.25))

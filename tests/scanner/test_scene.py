@@ -69,19 +69,6 @@ def test_what_is_seen_of_the_part_is_what_was_seen_without_the_rest(full):
     assert (range_now < bare.range_mm[np.searchsorted(bare.pixel, lost)] + ROUNDING_MM).all()
 
 
-def test_owners_are_the_extras_in_their_order(full):
-    part = len(vane().mesh.faces)
-    counts = [len(item.mesh.faces) for item in full.objects]
-    expected = np.repeat(np.arange(len(counts) + 1), [part, *counts])
-    owner = full.owner(np.arange(len(expected)))
-    np.testing.assert_array_equal(owner, expected)
-    assert owner.dtype == np.int32
-    corners = full.surface.mesh.triangles
-    np.testing.assert_allclose(
-        corners[owner == 2], full.objects[1].mesh.triangles, atol=ROUNDING_MM, rtol=0
-    )
-
-
 def test_a_seed_is_a_scene(full):
     again = clutter_scene(vane(), FULL, np.random.default_rng([0, 1]))
     other = clutter_scene(vane(), FULL, np.random.default_rng([0, 2]))

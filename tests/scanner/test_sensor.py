@@ -159,19 +159,6 @@ def test_noise_grows_where_less_light_comes_back(plate):
     assert spread(5.0) / spread(10.0) == pytest.approx(np.sqrt(2), rel=1e-3)
 
 
-def test_correlated_noise_is_smooth_white_noise_is_not(plate):
-    def neighbor_correlation(sensor: Sensor) -> float:
-        scan = take(plate, sensor)
-        beside = np.diff(scan.pixel) == 1
-        error = depth_error(scan)
-        return float(np.corrcoef(error[:-1][beside], error[1:][beside])[0, 1])
-
-    base = Sensor(camera=CAMERA)
-    smooth = dataclasses.replace(base, correlated_px=0.05, correlation_px=10.0)
-    assert neighbor_correlation(smooth) > 0.98
-    assert abs(neighbor_correlation(dataclasses.replace(base, noise_px=0.05))) < 0.03
-
-
 def test_errors_lie_along_the_pixel_s_ray(plate):
     scan = take(
         plate, Sensor(camera=CAMERA, noise_px=0.2, flying_pixel_rate=1.0, outlier_rate=0.01)

@@ -179,13 +179,6 @@ def test_a_sensor_that_is_no_place_is_refused(origin):
         clean_scan(wavy(), sensor_origin=origin)
 
 
-def test_a_stated_viewpoint_is_where_auto_looks():
-    place = np.array([30.0, -20.0, 50.0])
-    scan = clean_scan(wavy() + place, stated_origin=place)
-    assert np.array_equal(scan.sensor_origin, place)
-    assert "the file's viewpoint" in scan.notes[0]
-
-
 def test_a_single_view_of_the_vane_has_its_sensor_at_the_origin(vane_view):
     _, _, view = vane_view
     scan = clean_scan(view.points, view.normals)

@@ -133,7 +133,7 @@ CORNERS = st.lists(st.tuples(*[st.floats(-1e5, 1e5, width=32)] * 6), min_size=1,
     extra=st.booleans(),
     faces=st.integers(0, 2),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_ply_of_every_form(tmp_path_factory, values, form, types, with_normals, extra, faces):
     points, normals = values[:, :3], values[:, 3:] if with_normals else None
     data = ply(points, normals, form=form, types=types, extra=extra, faces=faces)
@@ -153,7 +153,7 @@ def test_ply_of_every_form(tmp_path_factory, values, form, types, with_normals, 
     kind=st.sampled_from(["f4", "f8"]),
     with_normals=st.booleans(),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_pcd_of_every_form(tmp_path_factory, values, form, kind, with_normals):
     points, normals = values[:, :3], values[:, 3:] if with_normals else None
     data = pcd(points, normals, form=form, kind=kind)
@@ -174,7 +174,7 @@ def test_pcd_of_every_form(tmp_path_factory, values, form, kind, with_normals):
     bom=st.booleans(),
     suffix=st.sampled_from([".xyz", ".txt", ".csv", ".asc"]),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_text_of_every_form(tmp_path_factory, values, apart, head, end, bom, suffix):
     points, normals = values[:, :3], values[:, 3:]
     data = table(points, normals, apart=apart, head=head.format(apart), end=end)
@@ -191,7 +191,7 @@ def test_text_of_every_form(tmp_path_factory, values, apart, head, end, bom, suf
     suffix=st.sampled_from(WRITTEN_SUFFIXES),
     with_normals=st.booleans(),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_what_is_saved_is_read_back(tmp_path_factory, values, suffix, with_normals):
     values = np.array(values)
     points, normals = values[:, :3], values[:, 3:].astype(np.float32)
@@ -447,7 +447,7 @@ WHOLE = {
     value=st.binary(max_size=6),
     length=st.floats(0, 1),
 )
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_no_damage_gives_any_other_error(tmp_path_factory, kind, position, value, length):
     data = WHOLE[kind]
     damaged = data[:position] + value + data[position + len(value) :]
@@ -555,7 +555,7 @@ def test_saving_refuses_what_cannot_be(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("number", range(1, 9))
+@pytest.mark.parametrize("number", [1, 5])
 def test_real_scans(number):
     path = REAL_SCANS / f"Separator_{number}.ply"
     if not path.exists():
