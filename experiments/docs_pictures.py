@@ -15,7 +15,15 @@ from vanejax.cad.parametric_vane import guide_vane
 from vanejax.cad.part import Part
 from vanejax.localization.pose_result import PoseResult
 from vanejax.localization.registration import register
-from vanejax.plotting.canvas import FAINT, INK, REFERENCE_RED, SOURCE_GREEN, new_figure, style_chart
+from vanejax.plotting.canvas import (
+    INK,
+    PAPER,
+    SERIES,
+    WIDTH_IN,
+    add_legend,
+    new_figure,
+    style_chart,
+)
 from vanejax.plotting.casting import casting_map
 from vanejax.plotting.matching import Matching, matching_lines
 from vanejax.plotting.segments import segments_picture
@@ -38,31 +46,31 @@ SHOWN = (0, 20, 85)  # views whose shadow is drawn
 
 def viewpoints_picture(sphere: Viewpoints, printed: Viewpoints, center: np.ndarray) -> Figure:
     """Where the cameras stand, seen from above, and how far away the printed formula puts them."""
-    figure = new_figure(9.6, 4.4)
+    figure = new_figure(WIDTH_IN, 3.5)
     above, away = figure.subplots(1, 2)
     place = sphere.position - center
     kinds = (
-        ("training (162)", ~sphere.is_test, SOURCE_GREEN),
-        ("test (54)", sphere.is_test, REFERENCE_RED),
+        ("training (162)", ~sphere.is_test, SERIES[0], "o"),
+        ("test (54)", sphere.is_test, SERIES[1], "^"),
     )
-    for name, which, color in kinds:
-        above.scatter(*place[which, :2].T, s=12, color=color, label=name, linewidths=0)
+    for name, which, color, marker in kinds:
+        x, y = place[which, :2].T
+        above.scatter(x, y, s=14, color=color, marker=marker, label=name, linewidths=0)
     above.set_aspect("equal")
     style_chart(above, title="cameras from above", xlabel="part's x (mm)", ylabel="part's y (mm)")
-    above.scatter(0, 0, marker="+", color=INK, s=60, label="the part's centre")
-    figure.legend(loc="outside lower center", ncols=5, frameon=False, labelcolor=INK, fontsize=9)
-    for elevation in (60.0, 85.0):
-        for name, views, color in (("as meant", sphere, INK), ("as printed", printed, FAINT)):
+    above.scatter(0, 0, marker="+", color=INK, s=50, label="the part's centre")
+    for elevation, line in ((60.0, "-"), (85.0, "--")):
+        for name, views, color in (("sphere", sphere, INK), ("as printed", printed, PAPER)):
             row = views.elevation_deg == elevation
             distance = np.linalg.norm(views.position[row] - center, axis=1)
-            style = "-" if elevation == 60.0 else "--"
             label = f"{name}, elevation {elevation:g}°"
-            away.plot(views.azimuth_deg[row], distance, style, color=color, label=label)
-    title = "distance from the part's centre by Algorithm 1"
-    style_chart(away, title=title, xlabel="azimuth (deg)", ylabel="mm")
-    away.set_ylim(380, 640)
+            away.plot(views.azimuth_deg[row], distance, line, color=color, label=label)
+    title = "distance from the part's centre (Algorithm 1)"
+    style_chart(away, title=title, xlabel="azimuth (deg)", ylabel="distance (mm)")
     away.set_xticks(range(0, 361, 90))
-    away.legend(frameon=False, labelcolor=INK, fontsize=9, loc="upper left", ncols=2)
+    for axes, columns in ((above, 3), (away, 2)):
+        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.15)}
+        add_legend(axes, ncols=columns, columnspacing=1.0, **below)
     return figure
 
 
@@ -135,7 +143,7 @@ def main(settings: argparse.Namespace) -> None:
     }
     settings.out.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():
-        plotting.save_figure(figure, settings.out / f"{name}.png", dpi=110)
+        plotting.save_figure(figure, settings.out / f"{name}.png")
         print(settings.out / f"{name}.png")
 
 

@@ -41,7 +41,10 @@ def _fine(report: Report) -> tuple[str, str]:
 def _position(report: Report) -> tuple[str, str]:
     turns = stand.magnitudes(report, stand.turns_of, "error_deg")
     moves = stand.magnitudes(report, stand.moves_of, "against_probe_mm")
-    (turn, largest_turn), (move, largest_move) = stand.PAPER["turns"], stand.PAPER["moves"]
+    (turn, largest_turn), (move, largest_move) = (
+        stand.PAPER["turns"],
+        stand.PAPER["moves"],
+    )
     return (
         "the paper's position verification, on a virtual stand; in brackets the paper's figures "
         "from its own machine",

@@ -85,11 +85,14 @@ def overlay(results: Results, scans: ScanSet, view: int) -> plotting.Overlay:
     """One registration as the figures want it: real points only, in mm."""
     source, target = results.pairs.source, results.pairs.target
     points = source.xyz[view][source.mask[view]]
-    found = results.registration.target_from_source
-    moved = points @ found.rotation[view].T + found.translation[view]
+    moved, true = (
+        points @ pose.rotation[view].T + pose.translation[view]
+        for pose in (results.registration.target_from_source, results.pairs.target_from_source)
+    )
     return plotting.Overlay(
         source=scans.radius_mm * points,
         moved=scans.radius_mm * moved,
+        true=scans.radius_mm * true,
         reference=scans.radius_mm * target.xyz[view][target.mask[view]],
         elevation_deg=scans.viewpoints.elevation_deg[view],
         azimuth_deg=scans.viewpoints.azimuth_deg[view],

@@ -233,9 +233,9 @@ def test_before_and_after_have_one_frame_and_differ():
     case = example_registration()
     before, after = overlay_pictures(case.result, case.scan, case.part)
     assert before.extent_mm == after.extent_mm
-    red, green = (after.image[..., k] for k in (0, 1))
+    red, blue_ = (after.image[..., k] for k in (0, 2))
     solid = after.image[..., 3] == 1
-    for color in (red > green + 0.2, green > red + 0.2):
+    for color in (red > blue_ + 0.2, blue_ > red + 0.2):  # CAD and scan
         assert np.count_nonzero(color & solid) > 0.05 * np.count_nonzero(solid)
     differs = np.abs(before.image - after.image).max(axis=-1) > 0.2
     assert np.count_nonzero(differs) > 0.1 * np.count_nonzero(solid)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from vanejax.errors import InputError
-from vanejax.plotting.canvas import REFERENCE_RED, SOURCE_GREEN
+from vanejax.plotting.canvas import RIGHT, WRONG
 from vanejax.plotting.matching import Matching, matching_lines
 
 
@@ -33,24 +33,24 @@ def titles(figure: Figure) -> list[str]:
     return [axes.get_title() for axes in figure.axes]
 
 
-def test_right_matches_are_parallel_and_green():
+def test_right_matches_are_parallel_and_dark():
     ends, colors = lines(matching_lines({"right": matching()}, partners=1))
     assert len(ends) == 20
     along = ends[:, 1] - ends[:, 0]
     np.testing.assert_allclose(along, np.tile(along[0], (20, 1)), atol=1e-9)  # f64, about 200 mm
     assert along[0, 0] > 100  # to the right, beyond the width of the cloud
     assert abs(along[0, 1]) < 1e-9
-    np.testing.assert_allclose(colors, np.tile((*to_rgb(SOURCE_GREEN), 1.0), (20, 1)))
+    np.testing.assert_allclose(colors, np.tile((*to_rgb(RIGHT), 1.0), (20, 1)))
 
 
-def test_wrong_matches_are_red_and_go_where_the_network_says():
+def test_wrong_matches_are_coloured_and_go_where_the_network_says():
     good = matching()
     shifted = dataclasses.replace(good, assignment=np.roll(good.assignment, 1, axis=1))
     figure = matching_lines({"right": good, "wrong": shifted}, partners=1, within_mm=1.0)
     right, wrong = lines(figure, 0)[0], lines(figure, 1)[0]
     np.testing.assert_allclose(wrong[:, 0], right[:, 0])
     np.testing.assert_allclose(wrong[:, 1], np.roll(right[:, 1], -1, axis=0))
-    assert (lines(figure, 1)[1][:, :3] == to_rgb(REFERENCE_RED)).all()
+    assert (lines(figure, 1)[1][:, :3] == to_rgb(WRONG)).all()
     assert "100 % of the weight within 1 mm" in titles(figure)[0]
     assert titles(figure)[1].splitlines()[1].startswith("0 % of the weight within 1 mm")
 

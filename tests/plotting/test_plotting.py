@@ -19,7 +19,7 @@ from matplotlib.text import Text
 from vanejax import plotting
 from vanejax.cad.part import part_from_mesh
 from vanejax.errors import InputError
-from vanejax.plotting.canvas import REFERENCE_RED, SOURCE_GREEN
+from vanejax.plotting.canvas import CAD, SCAN
 from vanejax.plotting.clouds import seen_and_hidden
 from vanejax.plotting.shading import crop
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
@@ -45,6 +45,7 @@ def overlay(seed: int = 0) -> plotting.Overlay:
     return plotting.Overlay(
         source=reference[:20] + np.array([30, -40, 10]),
         moved=reference[:20] + 0.5,
+        true=reference[:20],
         reference=reference,
         elevation_deg=65.0,
         azimuth_deg=120.0,
@@ -96,6 +97,7 @@ def every_figure(scans: list[Scan]) -> dict[str, Figure]:
         "overlays": plotting.registration_overlays([overlay(seed) for seed in range(6)]),
         "one overlay": plotting.registration_overlays([overlay()]),
         "failed": plotting.registration_overlays([overlay(), failed]),
+        "methods": plotting.method_displacements({"ICP": overlay(), "FGR": failed}),
         "error map": plotting.error_map(*views(6, 9)),
         "full map": plotting.error_map(*views(6, 36)),
         "small map": plotting.error_map(*views(2, 3)),
@@ -147,12 +149,13 @@ def test_figures_leave_no_trace_in_matplotlib(scans: list[Scan]) -> None:
 # ---------------------------------------------------------------- files
 
 
-def test_save_figure_leaves_one_whole_file(tmp_path: Path) -> None:
+def test_save_figure_leaves_whole_files(tmp_path: Path) -> None:
     path = tmp_path / "figure.png"
     path.write_text("an older picture")
     plotting.save_figure(plotting.error_map(*views(2, 3)), path, dpi=40)
     assert path.read_bytes().startswith(b"\x89PNG")
-    assert [entry.name for entry in tmp_path.iterdir()] == ["figure.png"]
+    assert path.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["figure.pdf", "figure.png"]
 
 
 def test_a_figure_that_cannot_be_drawn_leaves_the_old_file(tmp_path: Path) -> None:
@@ -182,11 +185,13 @@ def test_overlays_show_both_clouds_before_and_after() -> None:
         dots = axes.collections[0]
         assert len(dots.get_offsets()) == 80
         colors = dots.get_facecolors()[:, :3]
-        # depth only pales a colour: the largest channel tells green from red
-        assert (np.argmax(colors, axis=1) == np.argmax(to_rgb(SOURCE_GREEN))).sum() == 20
-        assert (np.argmax(colors, axis=1) == np.argmax(to_rgb(REFERENCE_RED))).sum() == 60
+        # depth only pales a colour: the largest channel tells blue from orange
+        assert (np.argmax(colors, axis=1) == np.argmax(to_rgb(SCAN))).sum() == 20
+        assert (np.argmax(colors, axis=1) == np.argmax(to_rgb(CAD))).sum() == 60
         assert axes.get_aspect() == 1
-    assert before.get_title() == "elevation 65°, azimuth 120°\n37 % visible"
+    assert before.get_title() == "elevation 65°\nazimuth 120°\n37 % visible"
+    assert before.get_xlim() == after.get_xlim()
+    assert before.get_ylim() == after.get_ylim()
     assert after.get_title() == "0.46°, 1.23 mm"
 
 
@@ -206,10 +211,20 @@ def test_near_points_are_drawn_over_far_ones() -> None:
     a, b = np.radians([plotting.READER_ELEVATION_DEG, plotting.READER_AZIMUTH_DEG])
     towards_reader = np.array([np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)])
     near, far = 10 * towards_reader[None], -10 * towards_reader[None]
-    for source, reference, top in ((near, far, SOURCE_GREEN), (far, near, REFERENCE_RED)):
+    for source, reference, top in ((near, far, SCAN), (far, near, CAD)):
         pair = dataclasses.replace(overlay(), source=source, moved=source, reference=reference)
         dots = plotting.registration_overlays([pair]).axes[1].collections[0]
         np.testing.assert_allclose(dots.get_facecolors()[-1, :3], to_rgb(top))
+
+
+def test_methods_are_told_apart_by_how_far_each_leaves_the_points() -> None:
+    near, far = overlay(), dataclasses.replace(overlay(), moved=overlay().true + 5.2)
+    panels = plotting.method_displacements({"near": near, "far": far}).axes[:2]
+    colors = [axes.collections[0].get_facecolors()[:, :3] for axes in panels]
+    assert [axes.get_title().splitlines()[0] for axes in panels] == ["near", "far"]
+    # 0.87 mm is green, 9 mm nearly the dark end of the scale: a quarter of the dots changes
+    assert colors[0].mean() > colors[1].mean() + 0.03
+    assert panels[0].get_xlim() == panels[1].get_xlim()
 
 
 def test_a_failed_registration_says_so() -> None:

@@ -62,8 +62,12 @@ def test_a_scan_that_is_too_far_by_a_tenth_stands_off_by_its_cosine(scanner):
 
 def test_a_panel_for_each_measurement_and_a_legend_of_what_is_seen(scanner):
     scans = {"ideal": Sensor(camera=SMALL), "shadow": Sensor(camera=SMALL, shadow=True)}
-    figure = measurements_picture({name: taken(scanner, s) for name, s in scans.items()})
-    assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == ["ideal", "shadow"]
+    scans_taken = {name: taken(scanner, s) for name, s in scans.items()}
+    figure = measurements_picture(scans_taken)
+    assert [axes.get_title(loc="left") for axes in figure.axes[:2]] == [
+        "ideal\nno error",
+        f"shadow\n{scans_taken['shadow'].hole_share:.1%} lost",
+    ]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["shadowed"]
     ideal, shadow = (axes.get_images()[0].get_array() for axes in figure.axes[:2])
     assert np.any(np.all(shadow == to_rgb(REASON_COLORS[Reason.SHADOWED]), axis=-1))
@@ -90,6 +94,7 @@ def test_the_command_measures_times_and_draws(tmp_path, capsys, monkeypatch):
     assert report["effects"]["strong light"]["hole_share"] > 0.2
     assert json.loads((tmp_path / "sensor_effects.json").read_text()) == report
     assert (tmp_path / "sensor_effects.png").stat().st_size > 20_000
+    assert (tmp_path / "sensor_effects.pdf").exists()
     assert "projector shadow" in capsys.readouterr().out
     report["effects"]["all"]["ratio"] = 3.5
     assert "MISSED" in table(report)
@@ -107,12 +112,12 @@ def test_a_segmentation_is_drawn_beside_the_truth():
     figure = segments_picture(scan, camera, scene, Segments(truth, ()))
     found, right = (axes.get_images()[0].get_array() for axes in figure.axes)
     np.testing.assert_array_equal(found, right)
-    assert "0.0% of the points otherwise" in figure.axes[0].get_title()
+    assert "0.0% of the points wrong" in figure.axes[0].get_title()
     wrong = truth.copy()
     wrong[: len(wrong) // 4] = Segment.OTHER
     figure = segments_picture(scan, camera, scene, Segments(wrong, ()))
     share = np.mean(wrong != truth)
     assert share > 0.1
-    assert f"{share:.1%} of the points otherwise" in figure.axes[0].get_title()
+    assert f"{share:.1%} of the points wrong" in figure.axes[0].get_title()
     with pytest.raises(InputError, match="the segmentation 1"):
         segments_picture(scan, camera, scene, Segments(truth[:1], ()))

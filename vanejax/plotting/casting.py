@@ -9,16 +9,21 @@ from matplotlib.colors import Colormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 
 from vanejax.cad.part import Part
-from vanejax.plotting.canvas import FAINT, INK, new_figure
-from vanejax.plotting.deviation import DEVIATION_COLORMAP
+from vanejax.plotting.canvas import (
+    DEVIATION_COLORMAP,
+    ERROR_COLORMAP,
+    FAINT,
+    INK,
+    LABEL_PT,
+    WIDTH_IN,
+    add_color_bar,
+    new_figure,
+)
 from vanejax.plotting.shading import crop, draw_part, shade
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
 from vanejax.scanner.ideal_scan import Scan
 from vanejax.scanner.virtual_scanner import Scanner
 
-# one hue that grows darker: stock has no middle to part from
-STOCK_COLORMAP = "YlGnBu"
-_PANEL_IN = 4.6  # high
 _PIXELS = 900
 _FIELD_DEG = 12.0  # from so far away a millimetre is nearly as long everywhere
 _SIDES_DEG = {"from above": (30.0, 40.0), "from below": (-25.0, 220.0)}  # elevation, azimuth
@@ -53,8 +58,8 @@ def casting_map(part: Part, cast: Part) -> Figure:
     widths = []
     for scan in scans:
         rows, columns = crop(scan, camera)
-        widths.append(_PANEL_IN * (columns.stop - columns.start) / (rows.stop - rows.start))
-    figure = new_figure(sum(widths) + 1.3, _PANEL_IN + 0.5)
+        widths.append((columns.stop - columns.start) / (rows.stop - rows.start))
+    figure = new_figure(WIDTH_IN, (WIDTH_IN - 0.9) / sum(widths) + 0.3)
     panels = figure.subplots(1, 2, width_ratios=widths)
     for axes, title, scan, offset in zip(panels, _SIDES_DEG, scans, offsets, strict=True):
         image = shade(scan, camera)
@@ -65,13 +70,11 @@ def casting_map(part: Part, cast: Part) -> Figure:
         bright = np.clip(light / np.percentile(light, 80), 0, 1)
         image.reshape(-1, 3)[scan.pixel] = color * (0.55 + 0.45 * bright)
         draw_part(axes, scan, camera, image)
-        axes.set_title(title, color=INK, fontsize=11)
-    bar = figure.colorbar(
-        ScalarMappable(scale, colors), ax=panels, fraction=0.025, pad=0.02, extend="both"
+        axes.set_title(title, color=INK, fontsize=LABEL_PT)
+    label = "offset from the CAD surface (mm), + outward"
+    add_color_bar(
+        figure, panels, ScalarMappable(scale, colors), label, fraction=0.025, extend="both"
     )
-    bar.outline.set_visible(False)
-    bar.ax.tick_params(colors=INK, labelsize=9, length=0)
-    bar.ax.set_ylabel("offset from the CAD surface (mm), + outward", color=INK, fontsize=10)
     return figure
 
 
@@ -93,4 +96,4 @@ def _scale(offset: np.ndarray) -> tuple[Normalize, Colormap]:
     if low < -0.01:
         limit = max(-low, high)
         return Normalize(-limit, limit), colormaps[DEVIATION_COLORMAP]
-    return Normalize(low, high), colormaps[STOCK_COLORMAP]
+    return Normalize(low, high), colormaps[ERROR_COLORMAP]

@@ -13,10 +13,19 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodF
 
 from vanejax.errors import InputError
 from vanejax.matching.metrics import mean_per_axis, mean_per_view
-from vanejax.plotting.canvas import GRID, INK, new_figure, style_chart
-
-# distinguishable for every kind of colour vision (Okabe and Ito, 2008)
-SERIES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
+from vanejax.plotting.canvas import (
+    ERROR_COLORMAP,
+    GRID,
+    INK,
+    MARKERS,
+    SERIES,
+    TICK_PT,
+    WIDTH_IN,
+    add_color_bar,
+    add_legend,
+    new_figure,
+    style_chart,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,7 +47,7 @@ def error_map(
     rotation_deg: np.ndarray,
     translation_mm: np.ndarray,
 ) -> Figure:
-    """Errors of V views over azimuth and elevation, a cell with its value for each view.
+    """Errors of V views over azimuth and elevation: a cell for each, with its value if it fits.
 
     Args:
       elevation_deg: [V] of the viewpoints, which need not fill the grid.
@@ -48,11 +57,9 @@ def error_map(
     """
     elevations, row = np.unique(elevation_deg, return_inverse=True)
     azimuths, column = np.unique(azimuth_deg, return_inverse=True)
-    wide = max(0.62 * len(azimuths) + 1.9, 4.2)
-    high = max(0.46 * len(elevations) + 1.1, 1.9)
-    side_by_side = wide < 8
-    size = (2 * wide, high) if side_by_side else (wide, 2 * high)
-    figure = new_figure(*size)
+    side_by_side = len(azimuths) <= 3
+    high = max(0.25 * len(elevations) + 0.7, 1.5)
+    figure = new_figure(WIDTH_IN, high if side_by_side else 2 * high)
     panels = figure.subplots(*((1, 2) if side_by_side else (2, 1)))
     for axes, values, title, unit in (
         (panels[0], rotation_deg, "rotation error", "deg"),
@@ -61,12 +68,13 @@ def error_map(
         cells = np.full((len(elevations), len(azimuths)), np.nan)
         there = np.zeros(cells.shape, bool)
         cells[row, column], there[row, column] = values, True
-        _heat_map(figure, axes, cells, there, f"{title} ({unit})")
+        _heat_map(figure, axes, cells, there, unit)
         style_chart(
             axes, title=f"{title} ({unit})", xlabel="azimuth (deg)", ylabel="elevation (deg)"
         )
         axes.grid(False)
-        axes.set_xticks(range(len(azimuths)), [f"{angle:g}" for angle in azimuths])
+        some = slice(None, None, -(-len(azimuths) // 18))
+        axes.set_xticks(range(len(azimuths))[some], [f"{angle:g}" for angle in azimuths[some]])
         axes.set_yticks(range(len(elevations)), [f"{angle:g}" for angle in elevations])
     return figure
 
@@ -82,7 +90,7 @@ def axis_errors(series: Mapping[str, AxisErrors]) -> Figure:
     """
     if not series:
         raise InputError("axis_errors needs at least one series")
-    figure = new_figure(11.0, 6.4)
+    figure = new_figure(WIDTH_IN, 4.4)
     panels = figure.subplots(2, 2, gridspec_kw={"width_ratios": (1, 2.2)})
     for (bars, lines), name, unit, equations in (
         (panels[0], "rotation", "deg", ("MRE, eq. 8", "MRE, eq. 10")),
@@ -94,16 +102,14 @@ def axis_errors(series: Mapping[str, AxisErrors]) -> Figure:
         }
         _axis_bars(bars, values)
         _view_lines(lines, values)
-        style_chart(bars, title=f"{name} error per axis ({equations[0]})", ylabel=unit)
-        title = f"{name} error per view, mean over the axes ({equations[1]})"
-        style_chart(lines, title=title, ylabel=unit)
-    order = "test view, in the order of elevation, then azimuth"
-    panels[1, 1].set_xlabel(order, color=INK, fontsize=10)
-    if len(series) > 1:
-        figure.legend(
-            *panels[0, 0].get_legend_handles_labels(), loc="outside upper right",
-            ncols=len(series), frameon=False, labelcolor=INK,
+        style_chart(
+            bars, title=f"per axis ({equations[0]})", xlabel="axis",
+            ylabel=f"mean {name} error ({unit})",
         )  # fmt: skip
+        title = f"per view, mean of the axes ({equations[1]})"
+        style_chart(lines, title=title, xlabel="test view, by elevation, then azimuth")
+    if len(series) > 1:
+        add_legend(figure, loc="outside upper right", ncols=len(series))
     return figure
 
 
@@ -120,7 +126,7 @@ def _axis_bars(axes: Axes, series: Mapping[str, np.ndarray]) -> None:
             color=SERIES[index % len(SERIES)],
             label=label,
         )
-        axes.bar_label(bars, fmt="%.2f", padding=2, color=INK, fontsize=9)
+        axes.bar_label(bars, fmt="%.2f", padding=2, color=INK, fontsize=7)
     axes.set_xticks(range(3), ["x", "y", "z"])
     axes.tick_params(axis="x", length=0)
     axes.margins(y=0.14)
@@ -132,20 +138,22 @@ def _view_lines(axes: Axes, series: Mapping[str, np.ndarray]) -> None:
         color = SERIES[index % len(SERIES)]
         views = np.arange(1, len(values) + 1)
         axes.plot(
-            views, np.asarray(mean_per_view(values)), "o-", color=color, markersize=3.5,
-            linewidth=1.1,
+            views, np.asarray(mean_per_view(values)), f"{MARKERS[index % len(MARKERS)]}-",
+            color=color, markersize=2.5, linewidth=0.9,
         )  # fmt: skip
         lost = views[~np.isfinite(values).all(axis=1)]
         if len(lost):
             axes.plot(lost, np.zeros(len(lost)), "x", color=color, label="failed")
-            axes.legend(frameon=False, fontsize=9, labelcolor=INK)
+            add_legend(axes)
     axes.set_ylim(bottom=0)
     axes.set_xlim(0.3, max(map(len, series.values())) + 0.7)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def training_curves(rows: Sequence[Mapping[str, float]]) -> Figure:
-    """Loss, rotation error and translation error over steps, with validation points over them.
+    """Loss, rotation and translation error over steps, with validation points over them.
+
+    Translation errors are at the part's centre.
 
     Args:
       rows: of a run's JSONL log: ``step`` and any of ``loss``, ``rotation_error_deg``,
@@ -154,13 +162,13 @@ def training_curves(rows: Sequence[Mapping[str, float]]) -> Figure:
     Raises:
       InputError: no row has any of them.
     """
-    figure = new_figure(13.0, 3.9)
+    figure = new_figure(WIDTH_IN, 2.4)
     panels = figure.subplots(1, 3)
     drawn = 0
     for axes, name, title, unit in (
         (panels[0], "loss", "training loss", ""),
         (panels[1], "rotation_error_deg", "rotation error", "deg"),
-        (panels[2], "translation_error_mm", "translation error at the part's centre", "mm"),
+        (panels[2], "translation_error_mm", "translation error", "mm"),
     ):
         steps, values = _column(rows, name)
         drawn += len(steps)
@@ -175,7 +183,7 @@ def training_curves(rows: Sequence[Mapping[str, float]]) -> Figure:
                 steps, values, "o", color=SERIES[5], markersize=4.5, markeredgecolor="white",
                 markeredgewidth=0.6, label="validation (averaged weights)",
             )  # fmt: skip
-            axes.legend(frameon=False, fontsize=9, labelcolor=INK)
+            add_legend(axes)
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())
@@ -185,20 +193,22 @@ def training_curves(rows: Sequence[Mapping[str, float]]) -> Figure:
     return figure
 
 
-def _heat_map(figure: Figure, axes: Axes, cells: np.ndarray, there: np.ndarray, label: str) -> None:
+def _heat_map(figure: Figure, axes: Axes, cells: np.ndarray, there: np.ndarray, unit: str) -> None:
     """Cells [R, C] as colours and numbers; ``there`` [R, C] tells failures from missing views."""
     finite = cells[np.isfinite(cells)]
     scale = Normalize(0.0, float(finite.max()) if finite.size and finite.max() > 0 else 1.0)
     axes.set_facecolor(GRID)
     image = axes.imshow(
-        np.ma.masked_invalid(cells), cmap="YlGnBu", norm=scale, origin="lower", aspect="auto"
+        np.ma.masked_invalid(cells), cmap=ERROR_COLORMAP, norm=scale, origin="lower", aspect="auto"
     )
+    roomy = cells.shape[1] <= 12
     for (row, column), value in np.ndenumerate(cells):
         if there[row, column]:
             dark = np.isfinite(value) and scale(value) > 0.55
+            words = f"{value:.2f}" if roomy else ""
             axes.text(
-                column, row, f"{value:.2f}" if np.isfinite(value) else "failed",
-                ha="center", va="center", fontsize=9, color="white" if dark else INK,
+                column, row, words if np.isfinite(value) else "failed" if roomy else "×",
+                ha="center", va="center", fontsize=TICK_PT, color="white" if dark else INK,
             )  # fmt: skip
     # white lines between the cells
     rows, columns = cells.shape
@@ -206,10 +216,7 @@ def _heat_map(figure: Figure, axes: Axes, cells: np.ndarray, there: np.ndarray, 
         axes.axvline(edge, color="white", linewidth=1.5)
     for edge in np.arange(0.5, rows - 1):
         axes.axhline(edge, color="white", linewidth=1.5)
-    bar = figure.colorbar(image, ax=axes, pad=0.02, fraction=0.05)
-    bar.outline.set_visible(False)
-    bar.ax.tick_params(colors=INK, labelsize=9, length=0)
-    bar.ax.set_ylabel(label.rpartition("(")[2].rstrip(")"), color=INK, fontsize=10)
+    add_color_bar(figure, axes, image, unit, fraction=0.05)
 
 
 def _column(rows: Sequence[Mapping[str, float]], name: str) -> tuple[np.ndarray, np.ndarray]:

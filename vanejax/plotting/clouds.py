@@ -6,12 +6,27 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, to_rgb
 from matplotlib.figure import Figure
 
 from vanejax.errors import InputError
-from vanejax.plotting.canvas import INK, REFERENCE_RED, SOURCE_GREEN, new_figure
+from vanejax.plotting.canvas import (
+    CAD,
+    FAINT,
+    HIDDEN,
+    INK,
+    LABEL_PT,
+    SCAN,
+    TICK_PT,
+    TITLE_PT,
+    WIDTH_IN,
+    add_color_bar,
+    name_colors,
+    new_figure,
+)
 from vanejax.pointcloud import voxel_thin
 from vanejax.scanner.camera import look_at
 from vanejax.scanner.ideal_scan import Scan
@@ -19,7 +34,7 @@ from vanejax.scanner.ideal_scan import Scan
 # Where the reader stands, as a viewpoint of the hemisphere: oblique enough to see a tilt.
 READER_ELEVATION_DEG = 50.0
 READER_AZIMUTH_DEG = 325.0
-_COLUMN_IN = 2.55
+DISPLACEMENT_MM = (0.1, 10.0)  # ends of the colours of `method_displacements`
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -29,6 +44,7 @@ class Overlay:
     Attributes:
       source: [N, 3] before registration.
       moved: [N, 3] after it; not finite where it failed.
+      true: [N, 3] where its points truly lie.
       reference: [M, 3].
       elevation_deg, azimuth_deg: of the view.
       visible_fraction: X / Y of the view, 0 to 1.
@@ -37,6 +53,7 @@ class Overlay:
 
     source: np.ndarray
     moved: np.ndarray
+    true: np.ndarray
     reference: np.ndarray
     elevation_deg: float
     azimuth_deg: float
@@ -44,13 +61,20 @@ class Overlay:
     rotation_error_deg: float
     translation_error_mm: float
 
+    @property
+    def error(self) -> str:
+        """The pose error in words."""
+        if not np.isfinite(self.rotation_error_deg + self.translation_error_mm):
+            return "no finite pose"
+        return f"{self.rotation_error_deg:.2f}°, {self.translation_error_mm:.2f} mm"
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Dots:
-    """A cloud [N, 3] in mm and how it is drawn; ``area`` is in points squared."""
+class Dots:
+    """A cloud [N, 3] in mm; one colour for all or [N, 3], 0 to 1; ``area`` in points squared."""
 
     points: np.ndarray
-    color: str
+    color: str | np.ndarray
     area: float
 
 
@@ -60,7 +84,7 @@ def view_name(elevation_deg: float, azimuth_deg: float) -> str:
 
 
 def registration_overlays(overlays: Sequence[Overlay]) -> Figure:
-    """Source (green) on reference (red) before and after registration, as in the paper's Fig. 7.
+    """Scan on CAD before and after registration, as in the paper's Fig. 7.
 
     One column for each registration; every panel has the same scale and the same direction.
 
@@ -69,39 +93,32 @@ def registration_overlays(overlays: Sequence[Overlay]) -> Figure:
     """
     if not overlays:
         raise InputError("registration_overlays needs at least one registration")
-    befores = [(overlay.source, overlay.reference) for overlay in overlays]
-    afters = [(overlay.moved, overlay.reference) for overlay in overlays]
-    row_limits = [limits([cloud for pair in row for cloud in pair]) for row in (befores, afters)]
-    heights = [_COLUMN_IN * height_per_width(limit) for limit in row_limits]
-    size = (_COLUMN_IN * len(overlays) + 0.3, sum(heights) + 1.5)
-    figure = new_figure(*size)
-    rows = figure.subplots(2, len(overlays), squeeze=False, gridspec_kw={"height_ratios": heights})
-    for column, overlay in enumerate(overlays):
-        for axes, limit, source in zip(
-            rows[:, column], row_limits, (overlay.source, overlay.moved), strict=True
-        ):
-            draw_overlay(axes, source, overlay.reference)
-            set_limits(axes, limit)
-        rows[0, column].set_title(
-            f"elevation {overlay.elevation_deg:g}°, azimuth {overlay.azimuth_deg:g}°\n"
-            f"{100 * overlay.visible_fraction:.0f} % visible",
-            color=INK,
-            fontsize=10,
-        )
-        rows[1, column].set_title(_pose_error(overlay), color=INK, fontsize=10, fontweight="bold")
+    limit = limits([c for o in overlays for c in (o.source, o.moved, o.reference)])
+    width = min(2.4, (WIDTH_IN - 0.4) / len(overlays))
+    figure = new_figure(width * len(overlays) + 0.4, 2 * width * height_per_width(limit) + 1.3)
+    rows = figure.subplots(2, len(overlays), squeeze=False)
+    for (before, after), overlay in zip(rows.T, overlays, strict=True):
+        for axes, source in ((before, overlay.source), (after, overlay.moved)):
+            draw_dots(axes, overlay_dots(source, overlay.reference, width), limit)
+        view = view_name(overlay.elevation_deg, overlay.azimuth_deg).replace(", ", "\n")
+        title = f"{view}\n{100 * overlay.visible_fraction:.0f} % visible"
+        before.set_title(title, color=INK, fontsize=TICK_PT)
+        after.set_title(overlay.error, color=INK, fontsize=TICK_PT, fontweight="bold")
     for axes, name in zip(rows[:, 0], ("before", "after"), strict=True):
         axes.text(
             0.0, 0.5, name, transform=axes.transAxes, rotation=90, ha="right", va="center",
-            color=INK, fontsize=11, fontweight="bold",
+            color=INK, fontsize=TITLE_PT, fontweight="bold",
         )  # fmt: skip
-    for axes in rows[:, 0]:
         _scale_bar(axes)
-    _cloud_legend(figure, "source (virtual scan)", "reference (CAD)")
+    name_colors(figure, {"scan": SCAN, "CAD": CAD})
     return figure
 
 
-def method_overlays(overlays: Mapping[str, Overlay], *, columns: int = 4) -> Figure:
-    """One view after registration by several methods, as in the paper's Fig. 3.
+def method_displacements(overlays: Mapping[str, Overlay], *, columns: int = 4) -> Figure:
+    """How far several methods leave the points of one view from where they truly lie.
+
+    The paper's Fig. 3 shows the clouds alone, which look alike. Here each point has the colour of
+    its displacement, on one logarithmic scale for all methods; the CAD model is grey.
 
     Args:
       overlays: by method, of the same view.
@@ -111,34 +128,34 @@ def method_overlays(overlays: Mapping[str, Overlay], *, columns: int = 4) -> Fig
       InputError: no registration.
     """
     if not overlays:
-        raise InputError("method_overlays needs at least one registration")
-    limit = limits([c for o in overlays.values() for c in (o.moved, o.reference)])
+        raise InputError("method_displacements needs at least one registration")
+    limit = limits([c for o in overlays.values() for c in (o.true, o.reference)])
     columns = min(columns, len(overlays))
     lines = -(-len(overlays) // columns)
-    height = _COLUMN_IN * height_per_width(limit)
-    figure = new_figure(_COLUMN_IN * columns + 0.3, (height + 0.4) * lines + 0.3)
+    width = (WIDTH_IN - 0.8) / columns
+    figure = new_figure(
+        width * columns + 0.8, (width * height_per_width(limit) + 0.45) * lines + 0.2
+    )
     panels = figure.subplots(lines, columns, squeeze=False)
+    scale = ScalarMappable(LogNorm(*DISPLACEMENT_MM, clip=True), colormaps["viridis_r"])
     for axes in panels.flat[len(overlays) :]:
         axes.set_axis_off()
     for axes, (name, overlay) in zip(panels.flat, overlays.items(), strict=False):
-        draw_overlay(axes, overlay.moved, overlay.reference)
-        set_limits(axes, limit)
-        axes.set_title(f"{name}\n{_pose_error(overlay)}", color=INK, fontsize=10)
+        displacement = np.linalg.norm(overlay.moved - overlay.true, axis=1)
+        color = scale.to_rgba(np.nan_to_num(displacement))[:, :3]
+        cloud = Dots(overlay.moved, color, 9.0 * (width / 2) ** 2)
+        draw_dots(axes, [Dots(overlay.reference, FAINT, 1.5 * (width / 2) ** 2), cloud], limit)
+        axes.set_title(f"{name}\n{overlay.error}", color=INK, fontsize=LABEL_PT)
     _scale_bar(panels[0, 0])
-    _cloud_legend(figure, "source (virtual scan)", "reference (CAD)")
+    add_color_bar(figure, panels, scale, "distance of each point from its true place (mm)",
+                  shrink=0.6, aspect=30, extend="both")  # fmt: skip
     return figure
-
-
-def _pose_error(overlay: Overlay) -> str:
-    if not np.isfinite(overlay.rotation_error_deg + overlay.translation_error_mm):
-        return "no finite pose"
-    return f"{overlay.rotation_error_deg:.2f}°, {overlay.translation_error_mm:.2f} mm"
 
 
 def view_and_shadow(
     scans: Sequence[Scan], names: Sequence[str], *, voxel_mm: float = 1.0
 ) -> Figure:
-    """What views see (green) and what self-occlusion hides from them (red): the paper's Fig. 5.
+    """What views see and what self-occlusion hides from them: the paper's Fig. 5.
 
     All panels show the part's frame from one direction, so that they can be compared.
 
@@ -156,18 +173,16 @@ def view_and_shadow(
     lines = -(-len(scans) // columns)
     pictures = [seen_and_hidden(scan, voxel_mm=voxel_mm) for scan in scans]
     limit = limits([cloud for pair in pictures for cloud in pair])
-    panel_in = 3.6
-    size = (panel_in * columns, (panel_in * height_per_width(limit) + 0.3) * lines + 0.4)
-    figure = new_figure(*size)
+    width = WIDTH_IN / 3
+    figure = new_figure(width * columns, (width * height_per_width(limit) + 0.3) * lines + 0.4)
     panels = figure.subplots(lines, columns, squeeze=False).ravel()
-    for axes, (seen, hidden), name in zip(panels, pictures, names, strict=False):
-        draw_view(axes, seen, hidden)
-        axes.set_title(name, color=INK, fontsize=10)
-        set_limits(axes, limit)
     for axes in panels[len(scans) :]:
         axes.set_axis_off()
+    for axes, clouds, name in zip(panels, pictures, names, strict=False):
+        draw_dots(axes, view_dots(*clouds, width), limit)
+        axes.set_title(name, color=INK, fontsize=LABEL_PT)
     _scale_bar(panels[0])
-    _cloud_legend(figure, "seen by the camera", "hidden by self-occlusion")
+    name_colors(figure, {"seen by the camera": SCAN, "hidden by self-occlusion": HIDDEN})
     return figure
 
 
@@ -185,14 +200,15 @@ def seen_and_hidden(scan: Scan, *, voxel_mm: float) -> tuple[np.ndarray, np.ndar
     return seen, hidden
 
 
-def draw_view(axes: Axes, seen: np.ndarray, hidden: np.ndarray) -> None:
-    """Seen and hidden points [N, 3] into axes."""
-    _draw(axes, [_Dots(hidden, REFERENCE_RED, 11.0), _Dots(seen, SOURCE_GREEN, 11.0)])
+def view_dots(seen: np.ndarray, hidden: np.ndarray, width_in: float) -> list[Dots]:
+    """Dense seen and hidden points [N, 3] that close their gaps in a panel so wide."""
+    return [Dots(points, color, 1.2 * width_in**2)
+            for points, color in ((hidden, HIDDEN), (seen, SCAN))]  # fmt: skip
 
 
-def draw_overlay(axes: Axes, source: np.ndarray, reference: np.ndarray) -> None:
-    """Source [N, 3] on reference [M, 3] into axes."""
-    _draw(axes, [_Dots(reference, REFERENCE_RED, 2.5), _Dots(source, SOURCE_GREEN, 6.5)])
+def overlay_dots(source: np.ndarray, reference: np.ndarray, width_in: float) -> list[Dots]:
+    """Source [N, 3] on reference [M, 3], for a panel so wide."""
+    return [Dots(reference, CAD, 0.7 * width_in**2), Dots(source, SCAN, 1.4 * width_in**2)]
 
 
 def flattened(points: np.ndarray) -> np.ndarray:
@@ -222,26 +238,25 @@ def height_per_width(limit: np.ndarray) -> float:
     return height / width
 
 
-def set_limits(axes: Axes, limit: np.ndarray) -> None:
-    """Shows what lies in limits [2, 2], lowest and highest (x, y)."""
-    axes.set_xlim(limit[:, 0])
-    axes.set_ylim(limit[:, 1])
-
-
-def _draw(axes: Axes, clouds: Sequence[_Dots]) -> None:
-    """Clouds as dots, far ones first and paler, so that near points hide far ones."""
+def draw_dots(axes: Axes, clouds: Sequence[Dots], limit: np.ndarray) -> None:
+    """Clouds into ``limit`` [2, 2], far dots first and paler, so that near points hide far ones."""
     flat = np.concatenate([flattened(cloud.points) for cloud in clouds])
     areas = np.concatenate([np.full(len(cloud.points), cloud.area) for cloud in clouds])
-    colors = np.concatenate([np.tile(to_rgb(c.color), (len(c.points), 1)) for c in clouds])
+    colors = np.concatenate(
+        [
+            np.tile(to_rgb(c.color), (len(c.points), 1)) if isinstance(c.color, str) else c.color
+            for c in clouds
+        ]
+    )
     finite = np.isfinite(flat).all(axis=1)
     flat, areas, colors = flat[finite], areas[finite], colors[finite]
     axes.set_axis_off()
-    axes.set_aspect("equal")
+    axes.set(aspect="equal", xlim=limit[:, 0], ylim=limit[:, 1])
     if not len(flat):
         return
     depth = flat[:, 2]
     far = (depth.max() - depth) / max(float(np.ptp(depth)), 1e-9)
-    colors = colors + (1 - colors) * 0.45 * far[:, None]
+    colors = colors + (1 - colors) * 0.35 * far[:, None]
     order = np.argsort(depth, kind="stable")
     axes.scatter(
         flat[order, 0], flat[order, 1], s=areas[order], c=colors[order], linewidths=0, zorder=2
@@ -253,21 +268,8 @@ def _scale_bar(axes: Axes, length_mm: float = 20.0) -> None:
     left, right = axes.get_xlim()
     bottom, top = axes.get_ylim()
     x, y = left + 0.02 * (right - left), bottom + 0.01 * (top - bottom)
-    axes.plot([x, x + length_mm], [y, y], color=INK, linewidth=2, solid_capstyle="butt")
+    axes.plot([x, x + length_mm], [y, y], color=INK, linewidth=1.5, solid_capstyle="butt")
     axes.text(
-        x + length_mm / 2, y + 0.012 * (top - bottom), f"{length_mm:g} mm", color=INK, fontsize=8,
-        ha="center", va="bottom",
-    )  # fmt: skip
-
-
-def _cloud_legend(figure: Figure, green: str, red: str) -> None:
-    """Names the two clouds below the panels."""
-    axes = figure.axes[0]
-    entries = [
-        axes.scatter([], [], s=36, color=color, label=label, linewidths=0)
-        for color, label in ((SOURCE_GREEN, green), (REFERENCE_RED, red))
-    ]
-    figure.legend(
-        handles=entries, loc="outside lower center", ncols=2, frameon=False, fontsize=10,
-        labelcolor=INK, handletextpad=0.2,
+        x + length_mm / 2, y + 0.012 * (top - bottom), f"{length_mm:g} mm", color=INK,
+        fontsize=TICK_PT, ha="center", va="bottom",
     )  # fmt: skip

@@ -11,9 +11,16 @@ from matplotlib.figure import Figure
 from vanejax.cad.part import Part
 from vanejax.localization.pose_result import PointStatus, PoseResult, Verification
 from vanejax.plotting.canvas import (
+    CAD,
+    DEVIATION_COLORMAP,
     INK,
-    REFERENCE_RED,
-    SOURCE_GREEN,
+    LABEL_PT,
+    NO_PARTNER,
+    SCAN,
+    WIDTH_IN,
+    add_color_bar,
+    add_legend,
+    name_colors,
     new_figure,
     style_chart,
 )
@@ -21,18 +28,15 @@ from vanejax.plotting.scene import Picture, Scene, reader_rotation, show
 from vanejax.rigid import RigidTransform
 from vanejax.scans.measured_scan import MeasuredScan
 
-# blue below the surface, red above it; ColorBrewer's scale, safe for every kind of colour vision
-DEVIATION_COLORMAP = "RdYlBu_r"
-NO_PARTNER = "#8b3fb0"
 STATUS_COLORS = {
-    PointStatus.INLIER: SOURCE_GREEN,
-    PointStatus.BEFORE: "#e69f00",
-    PointStatus.BEHIND: "#d55e00",
+    PointStatus.INLIER: SCAN,
+    PointStatus.BEFORE: "#cc79a7",
+    PointStatus.BEHIND: "#8c2d04",
     PointStatus.BESIDE: NO_PARTNER,
 }
 # the second look on the same scan: far enough round to see what the first one foreshortens
 OBLIQUE_YAW_DEG, OBLIQUE_PITCH_DEG = 48.0, 18.0
-_PANEL_IN = 4.6
+_PANEL_IN = 3.2
 _MAX_DOTS = 100_000
 
 
@@ -49,31 +53,23 @@ def deviation_map(
     """
     pictures = deviation_pictures(result, scan, part, scene=scene)
     limit = color_limit_mm(result.verification)
-    figure = new_figure(2 * _PANEL_IN + 1.1, _PANEL_IN * _tallest(pictures) + 0.9)
-    panels = figure.subplots(1, 2)
+    mm_per_in = sum(picture.width_mm for picture in pictures) / (2 * _PANEL_IN)
+    high = max(picture.width_mm * picture.height_per_width for picture in pictures) / mm_per_in
+    figure = new_figure(WIDTH_IN, high + 0.6)
+    # one scale for both
+    panels = figure.subplots(1, 2, width_ratios=[picture.width_mm for picture in pictures])
     for axes, picture, title in zip(
         panels, pictures, ("from the sensor's side", "from further left and above"), strict=True
     ):
         show(axes, picture)
-        axes.set_title(title, color=INK, fontsize=11)
+        axes.set_title(title, color=INK, fontsize=LABEL_PT)
     scale = ScalarMappable(Normalize(-limit, limit), colormaps[DEVIATION_COLORMAP])
-    bar = figure.colorbar(scale, ax=panels, fraction=0.025, pad=0.02, extend="both")
-    bar.outline.set_visible(False)
-    bar.ax.tick_params(colors=INK, labelsize=9, length=0)
-    bar.ax.set_ylabel(
-        "deviation from the CAD surface (mm), + outside the material", color=INK, fontsize=10
-    )
+    label = "deviation from the CAD surface (mm)\n+ outside the material"
+    add_color_bar(figure, panels, scale, label, fraction=0.025, extend="both")
     lost = np.count_nonzero(np.isnan(result.verification.deviation_mm))
     if lost:
         share = 100 * lost / len(result.verification.deviation_mm)
-        entry = panels[0].scatter(
-            [], [], s=36, color=NO_PARTNER, linewidths=0,
-            label=f"no partner on the part ({share:.1f} %)",
-        )  # fmt: skip
-        figure.legend(
-            handles=[entry], loc="outside lower center", frameon=False, fontsize=10,
-            labelcolor=INK, handletextpad=0.2,
-        )  # fmt: skip
+        name_colors(figure, {f"no partner on the part ({share:.1f} %)": NO_PARTNER})
     return figure
 
 
@@ -89,7 +85,7 @@ def residual_histogram(result: PoseResult) -> Figure:
     status = verification.status[finite]
     limit = float(np.fmax(1.6 * verification.tolerance_mm, color_limit_mm(verification)))
     edges = np.linspace(-limit, limit, 97)
-    figure = new_figure(6.6, 3.9)
+    figure = new_figure(5.0, 2.9)
     axes = figure.subplots()
     style_chart(axes, xlabel="deviation from the CAD surface (mm)", ylabel="points")
     shown = [s for s in PointStatus if (status == s).any()]
@@ -114,15 +110,17 @@ def residual_histogram(result: PoseResult) -> Figure:
     beyond = np.count_nonzero(np.abs(deviation) > limit)
     if beyond:
         axes.set_title(
-            f"{beyond:,} points lie beyond ±{limit:.3g} mm", color=INK, fontsize=9, loc="right"
+            f"{beyond:,} points lie beyond ±{limit:.3g} mm",
+            color=INK,
+            fontsize=LABEL_PT,
+            loc="right",
         )
     axes.set_xlim(-limit, limit)
     entries = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
-    order = [name for name in (*(s.name.lower() for s in shown), *entries) if name in entries]
-    figure.legend(
-        [entries[name] for name in dict.fromkeys(order)], list(dict.fromkeys(order)),
-        loc="outside upper center", ncols=6, frameon=False, fontsize=9, labelcolor=INK,
-        handlelength=1.4, columnspacing=1.4,
+    order = dict.fromkeys([*(s.name.lower() for s in shown), *entries])
+    add_legend(
+        figure, [entries[name] for name in order], loc="outside upper center", ncols=6,
+        handlelength=1.4, columnspacing=1.2,
     )  # fmt: skip
     return figure
 
@@ -130,7 +128,7 @@ def residual_histogram(result: PoseResult) -> Figure:
 def overlay_before_after(
     result: PoseResult, scan: MeasuredScan, part: Part, *, scene: Scene | None = None
 ) -> Figure:
-    """The scan (green) on the CAD model (red) at the first guess and at the result.
+    """The scan on the CAD model at the first guess and at the result.
 
     Args:
       result: `PoseResult.before` and `PoseResult.part_from_camera` are drawn.
@@ -139,20 +137,13 @@ def overlay_before_after(
       scene: of the same part, if there is one already.
     """
     pictures = overlay_pictures(result, scan, part, scene=scene)
-    figure = new_figure(2 * _PANEL_IN + 0.2, _PANEL_IN * _tallest(pictures) + 0.9)
+    figure = new_figure(WIDTH_IN, WIDTH_IN / 2 * pictures[0].height_per_width + 0.6)
     for axes, picture, title in zip(
         figure.subplots(1, 2), pictures, ("before", "after"), strict=True
     ):
         show(axes, picture)
-        axes.set_title(title, color=INK, fontsize=11, fontweight="bold")
-    entries = [
-        figure.axes[0].scatter([], [], s=36, color=color, label=label, linewidths=0)
-        for color, label in ((SOURCE_GREEN, "scan"), (REFERENCE_RED, "CAD"))
-    ]
-    figure.legend(
-        handles=entries, loc="outside lower center", ncols=2, frameon=False, fontsize=10,
-        labelcolor=INK, handletextpad=0.2,
-    )  # fmt: skip
+        axes.set_title(title, color=INK, fontsize=LABEL_PT, fontweight="bold")
+    name_colors(figure, {"scan": SCAN, "CAD": CAD})
     return figure
 
 
@@ -205,9 +196,9 @@ def overlay_pictures(
     some = scan.points[_choice(len(scan.points))]
     clouds = [pose.apply(some) for pose in (result.before, result.part_from_camera)]
     frame = scene.frame(reader, clouds)
-    color = np.tile(to_rgb(SOURCE_GREEN), (len(some), 1))
+    color = np.tile(to_rgb(SCAN), (len(some), 1))
     before, after = (
-        scene.draw(reader, cloud, color, frame=frame, part_color=REFERENCE_RED, pixels=600)
+        scene.draw(reader, cloud, color, frame=frame, part_color=CAD, pixels=600)
         for cloud in clouds
     )
     return before, after
@@ -221,13 +212,13 @@ def pose_picture(
     scene: Scene | None = None,
     pixels: int = 360,
 ) -> Picture:
-    """The scan (green) on the CAD model (red) at any pose, a small picture for alternatives."""
+    """The scan on the CAD model at any pose, a small picture for alternatives."""
     scene = scene or Scene(part)
     reader = overlay_rotation(scan, part, part_from_camera)
     cloud = part_from_camera.apply(scan.points[_choice(len(scan.points))])
     return scene.draw(
-        reader, cloud, np.tile(to_rgb(SOURCE_GREEN), (len(cloud), 1)),
-        frame=scene.frame(reader, [cloud]), part_color=REFERENCE_RED, pixels=pixels,
+        reader, cloud, np.tile(to_rgb(SCAN), (len(cloud), 1)),
+        frame=scene.frame(reader, [cloud]), part_color=CAD, pixels=pixels,
     )  # fmt: skip
 
 
@@ -249,8 +240,3 @@ def _lift_mm(result: PoseResult) -> float:
     """How far below the surface a point is still drawn on it: what noise alone may do."""
     tolerance = result.verification.tolerance_mm
     return tolerance if np.isfinite(tolerance) else 0.0
-
-
-def _tallest(pictures: tuple[Picture, Picture]) -> float:
-    """The larger height per width."""
-    return max(picture.height_per_width for picture in pictures)

@@ -1,4 +1,4 @@
-"""Pictures of soft assignments: which point of the CAD model a network takes a scan's point for."""
+"""Pictures of soft assignments: which CAD points a network assigns to the points of a scan."""
 
 from __future__ import annotations
 
@@ -14,12 +14,20 @@ from matplotlib.lines import Line2D
 from scipy.spatial.distance import cdist
 
 from vanejax.errors import InputError
-from vanejax.plotting.canvas import INK, REFERENCE_RED, SOURCE_GREEN, new_figure
-from vanejax.plotting.clouds import draw_overlay, flattened, height_per_width, limits, set_limits
+from vanejax.plotting.canvas import (
+    CAD,
+    INK,
+    LABEL_PT,
+    RIGHT,
+    SCAN,
+    WIDTH_IN,
+    WRONG,
+    add_legend,
+    new_figure,
+)
+from vanejax.plotting.clouds import draw_dots, flattened, height_per_width, limits, overlay_dots
 
-_PANEL_IN = 5.2
 _GAP = 1.12  # of the width of what is drawn: how far the scan is moved aside
-_RIGHT_COLOR, _WRONG_COLOR = SOURCE_GREEN, REFERENCE_RED
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,12 +65,12 @@ def matching_lines(
     points: int = 60,
     partners: int = 6,
 ) -> Figure:
-    """Soft assignments as lines from the scan, moved aside, to the CAD points it is taken for.
+    """Soft assignments as lines from the scan, moved aside, to the assigned CAD points.
 
     The scan is drawn in its true pose, only shifted to the left: right matches are parallel lines.
     Of some points the strongest partners are drawn. Opacity is the square root of the weight, the
     strongest of all panels opaque: weights of an untrained network, thousandths, stay visible.
-    Green lines end within ``within_mm`` of the true place, red ones do not.
+    Dark lines end within ``within_mm`` of the true place, vermilion ones do not.
 
     Args:
       matchings: by title, such as before and after training; one panel each.
@@ -84,35 +92,31 @@ def matching_lines(
     limit[0, 1] += 0.06 * (limit[1, 0] - limit[0, 0])  # no scale bar here
     lines = {title: _strongest(matching, points, partners) for title, matching in matchings.items()}
     opaque = max([weight.max() for _, _, weight in lines.values() if len(weight)], default=1.0)
-    width = _PANEL_IN if len(matchings) > 1 else 1.3 * _PANEL_IN
-    figure = new_figure(width * len(matchings), width * height_per_width(limit) + 1.4)
+    width = WIDTH_IN / max(2, len(matchings))
+    figure = new_figure(width * len(matchings), width * height_per_width(limit) + 1.3)
     for axes, (title, matching) in zip(
         figure.subplots(1, len(matchings), squeeze=False)[0], matchings.items(), strict=True
     ):
-        draw_overlay(axes, apart[title], matching.target)
+        draw_dots(axes, overlay_dots(apart[title], matching.target, 0.5 * width), limit)
         row, column, weight = lines[title]
         right = matching.near(within_mm)[row, column]
         ends = np.stack([apart[title][row], matching.target[column]], axis=1)
         _draw_lines(axes, ends, right, np.sqrt(weight / opaque))
-        set_limits(axes, limit)
         share = matching.right_share(within_mm)
-        told = f"{100 * share:.0f} % of the weight within {within_mm:g} mm of the true place"
+        quality = f"{100 * share:.0f} % of the weight within {within_mm:g} mm"
         axes.set_title(
-            f"{title}\n{told if np.isfinite(share) else 'nothing is matched'}\n"
+            f"{title}\n{quality if np.isfinite(share) else 'nothing is matched'}\n"
             f"strongest weight {weight.max(initial=0.0):.2g}",
             color=INK,
-            fontsize=10,
+            fontsize=LABEL_PT,
         )
     entries = [
-        Line2D([], [], marker="o", linestyle="", color=SOURCE_GREEN, label="scan, moved aside"),
-        Line2D([], [], marker="o", linestyle="", color=REFERENCE_RED, label="CAD"),
-        Line2D([], [], color=_RIGHT_COLOR, label="right match"),
-        Line2D([], [], color=_WRONG_COLOR, label="wrong match"),
+        Line2D([], [], marker="o", linestyle="", color=SCAN, label="scan, moved aside"),
+        Line2D([], [], marker="o", linestyle="", color=CAD, label="CAD"),
+        Line2D([], [], color=RIGHT, label="right match"),
+        Line2D([], [], color=WRONG, label="wrong match"),
     ]
-    figure.legend(
-        handles=entries, loc="outside lower center", ncols=4, frameon=False, fontsize=10,
-        labelcolor=INK,
-    )  # fmt: skip
+    add_legend(figure, entries, loc="outside lower center", ncols=4 if len(matchings) > 1 else 2)
     return figure
 
 
@@ -130,8 +134,8 @@ def _strongest(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows, columns and weights [L] of the strongest partners of some points, weak ones first."""
     rows = np.flatnonzero(matching.assignment.sum(axis=1) > 0)
-    some = np.unique(np.linspace(0, len(rows) - 1, min(points, len(rows))).astype(int))
-    rows = rows[some]
+    chosen = np.unique(np.linspace(0, len(rows) - 1, min(points, len(rows))).astype(int))
+    rows = rows[chosen]
     columns = np.argsort(-matching.assignment[rows], axis=1, kind="stable")[:, :partners]
     row, column = np.repeat(rows, columns.shape[1]), columns.ravel()
     weight = matching.assignment[row, column]
@@ -141,11 +145,11 @@ def _strongest(
 
 def _draw_lines(axes: Axes, ends: np.ndarray, right: np.ndarray, opacity: np.ndarray) -> None:
     """Lines between ends [L, 2, 3] into axes, below the dots; ``right`` [L], ``opacity`` [L]."""
-    colors = np.where(right[:, None], to_rgb(_RIGHT_COLOR), to_rgb(_WRONG_COLOR))
+    colors = np.where(right[:, None], to_rgb(RIGHT), to_rgb(WRONG))
     flat = flattened(ends.reshape(-1, 3))[:, :2].reshape(-1, 2, 2)
     axes.add_collection(
         LineCollection(
-            flat, colors=np.concatenate([colors, opacity[:, None]], axis=1), linewidths=0.8,
+            flat, colors=np.concatenate([colors, opacity[:, None]], axis=1), linewidths=0.6,
             zorder=1,
         )
     )  # fmt: skip

@@ -9,21 +9,31 @@ from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 from matplotlib.patches import ConnectionPatch
 
-from vanejax.plotting.canvas import FAINT, INK, REFERENCE_RED, SOURCE_GREEN, new_figure
+from vanejax.plotting.canvas import (
+    CAD,
+    FAINT,
+    HIDDEN,
+    INK,
+    LABEL_PT,
+    SCAN,
+    TITLE_PT,
+    WIDTH_IN,
+    new_figure,
+)
 from vanejax.plotting.clouds import (
     Overlay,
-    draw_overlay,
-    draw_view,
+    draw_dots,
     height_per_width,
     limits,
+    overlay_dots,
     seen_and_hidden,
-    set_limits,
+    view_dots,
 )
 from vanejax.plotting.shading import crop, draw_part, shade
 from vanejax.scanner.camera import Camera
 from vanejax.scanner.ideal_scan import Scan
 
-_HEIGHT_IN, _GAP_IN = 3.4, 0.7
+_GAP_IN = 0.3
 
 
 def overview_picture(portrait: Scan, camera: Camera, scan: Scan, overlay: Overlay) -> Figure:
@@ -37,35 +47,28 @@ def overview_picture(portrait: Scan, camera: Camera, scan: Scan, overlay: Overla
     """
     rows, columns = crop(portrait, camera)
     wide, high = (columns.stop - columns.start) / camera.fx, (rows.stop - rows.start) / camera.fy
-    pictures = (
-        seen_and_hidden(scan, voxel_mm=1.0),
-        (overlay.source, overlay.reference),
-        (overlay.moved, overlay.reference),
-    )
-    frames = [limits(clouds) for clouds in pictures]
+    view = seen_and_hidden(scan, voxel_mm=1.0)
+    frames = [limits(view), *(limits([c, overlay.reference])
+                              for c in (overlay.source, overlay.moved))]  # fmt: skip
     widths = [wide / high] + [1 / height_per_width(frame) for frame in frames]
-    figure = new_figure(_HEIGHT_IN * sum(widths) + 3 * _GAP_IN, _HEIGHT_IN + 0.7)
-    figure.get_layout_engine().set(wspace=4 * _GAP_IN / (_HEIGHT_IN * sum(widths)))
+    height = (WIDTH_IN - 3 * _GAP_IN) / sum(widths)
+    figure = new_figure(WIDTH_IN, height + 0.5)
+    figure.get_layout_engine().set(wspace=4 * _GAP_IN / WIDTH_IN)
     panels = figure.subplots(1, 4, gridspec_kw={"width_ratios": widths})
     draw_part(panels[0], portrait, camera, shade(portrait, camera))
-    for axes, clouds, frame, drawn in zip(
-        panels[1:], pictures, frames, (draw_view, draw_overlay, draw_overlay), strict=True
-    ):
-        drawn(axes, *clouds)
-        set_limits(axes, frame)
-    _caption(panels[0], "CAD part", [("all that is given", FAINT)])
+    dots = [view_dots(*view, height * widths[1])]
+    dots += [overlay_dots(c, overlay.reference, 1.6) for c in (overlay.source, overlay.moved)]
+    for axes, clouds, frame in zip(panels[1:], dots, frames, strict=True):
+        draw_dots(axes, clouds, frame)
+    _caption(panels[0], "CAD part", [("the only input", INK)])
     _caption(
-        panels[1],
-        "virtual scan",
-        [("seen", SOURCE_GREEN), (" and ", FAINT), ("self-occluded", REFERENCE_RED)],
+        panels[1], "virtual scan", [("● ", SCAN), ("seen  ", INK), ("● ", HIDDEN), ("hidden", INK)]
     )
     _caption(
-        panels[2],
-        "before registration",
-        [("scan", SOURCE_GREEN), (" and ", FAINT), ("CAD", REFERENCE_RED), (", noisy", FAINT)],
+        panels[2], "before registration", [("● ", SCAN), ("scan  ", INK), ("● ", CAD), ("CAD", INK)]
     )
-    error = f"{overlay.rotation_error_deg:.2f}°, {overlay.translation_error_mm:.2f} mm off"
-    _caption(panels[3], "after registration", [(error, FAINT)])
+    error = f"{overlay.rotation_error_deg:.2f}°, {overlay.translation_error_mm:.2f} mm error"
+    _caption(panels[3], "after registration", [(error, INK)])
     for left, right in itertools.pairwise(panels):
         _arrow(figure, left, right)
     return figure
@@ -73,8 +76,8 @@ def overview_picture(portrait: Scan, camera: Camera, scan: Scan, overlay: Overla
 
 def _caption(axes: Axes, title: str, words: list[tuple[str, str]]) -> None:
     """A bold title and, below it, words in their own colours."""
-    axes.set_title(title + "\n", color=INK, fontsize=14, fontweight="bold")
-    areas = [TextArea(w, textprops={"color": color, "fontsize": 11.5}) for w, color in words]
+    axes.set_title(title + "\n", color=INK, fontsize=TITLE_PT, fontweight="bold")
+    areas = [TextArea(w, textprops={"color": color, "fontsize": LABEL_PT}) for w, color in words]
     axes.add_artist(
         AnchoredOffsetbox(
             "lower center",
@@ -92,6 +95,6 @@ def _arrow(figure: Figure, left: Axes, right: Axes) -> None:
     figure.add_artist(
         ConnectionPatch(
             (1.0, 0.5), (0.0, 0.5), "axes fraction", "axes fraction", axesA=left, axesB=right,
-            arrowstyle="-|>", color=FAINT, linewidth=2, mutation_scale=18,
+            arrowstyle="-|>", color=FAINT, linewidth=1.2, mutation_scale=9,
         )
     )  # fmt: skip

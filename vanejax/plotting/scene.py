@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from vanejax.cad.part import Part
-from vanejax.plotting.canvas import INK
+from vanejax.plotting.canvas import INK, TICK_PT
 from vanejax.plotting.clouds import READER_AZIMUTH_DEG, READER_ELEVATION_DEG
 from vanejax.plotting.shading import shade
 from vanejax.rigid import RigidTransform
@@ -175,9 +175,9 @@ def show(axes: Axes, picture: Picture) -> None:
     left, right, bottom, top = picture.extent_mm
     length = scale_bar_mm(picture.width_mm)
     x, y = left + 0.02 * (right - left), bottom - 0.02 * (top - bottom)
-    axes.plot([x, x + length], [y, y], color=INK, linewidth=2, solid_capstyle="butt")
+    axes.plot([x, x + length], [y, y], color=INK, linewidth=1.5, solid_capstyle="butt")
     axes.text(
-        x + length / 2, y - 0.012 * (top - bottom), f"{length:g} mm", color=INK, fontsize=8,
+        x + length / 2, y - 0.012 * (top - bottom), f"{length:g} mm", color=INK, fontsize=TICK_PT,
         ha="center", va="top",
     )  # fmt: skip
     axes.set_xlim(left, right)

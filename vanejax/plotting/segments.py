@@ -1,4 +1,4 @@
-"""One picture of a segmentation: what each point of a scan was taken for, beside what it is."""
+"""One picture of a segmentation: the label of each point of a scan, beside the true one."""
 
 from __future__ import annotations
 
@@ -8,20 +8,24 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from vanejax.errors import InputError
-from vanejax.plotting.canvas import INK, REFERENCE_RED, SOURCE_GREEN, new_figure
+from vanejax.plotting.canvas import (
+    CLUTTER,
+    INK,
+    LABEL_PT,
+    SCAN,
+    TABLE,
+    WIDTH_IN,
+    name_colors,
+    new_figure,
+)
 from vanejax.plotting.shading import shade
 from vanejax.scanner.camera import Camera
 from vanejax.scanner.clutter import ClutterScene
 from vanejax.scanner.ideal_scan import Scan
 from vanejax.scans.segmentation import Segment, Segments
 
-TABLE_SAND = "#d9c9a3"
-_COLORS = {
-    Segment.PART: SOURCE_GREEN,
-    Segment.TABLE: TABLE_SAND,
-    Segment.OTHER: REFERENCE_RED,
-}
-_NAMES = {Segment.PART: "part", Segment.TABLE: "table", Segment.OTHER: "other things"}
+_COLORS = {Segment.PART: SCAN, Segment.TABLE: TABLE, Segment.OTHER: CLUTTER}
+_NAMES = {Segment.PART: "part", Segment.TABLE: "table", Segment.OTHER: "clutter"}
 
 
 def segments_picture(scan: Scan, camera: Camera, scene: ClutterScene, segments: Segments) -> Figure:
@@ -47,24 +51,17 @@ def segments_picture(scan: Scan, camera: Camera, scene: ClutterScene, segments: 
     truth = np.array(kinds, np.uint8)[owner]
     light = shade(scan, camera)
     aspect = camera.fx / camera.fy
-    height_in = 4.6 * aspect * camera.height / camera.width
-    figure = new_figure(9.6, height_in + 0.9)
+    figure = new_figure(WIDTH_IN, WIDTH_IN / 2 * aspect * camera.height / camera.width + 0.6)
     wrong = float(np.mean(segments.label != truth))
     for axes, label, title in zip(
         figure.subplots(1, 2),
         (segments.label, truth),
-        (f"taken for ({wrong:.1%} of the points otherwise than they are)", "truth"),
+        (f"segmentation ({wrong:.1%} of the points wrong)", "truth"),
         strict=True,
     ):
         _draw(axes, _colored(light, scan, camera, label), aspect, title)
     present = [s for s in Segment if np.any(truth == s) or np.any(segments.label == s)]
-    handles = [
-        figure.axes[0].scatter([], [], s=50, color=_COLORS[s], label=_NAMES[s]) for s in present
-    ]
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=10,
-        labelcolor=INK,
-    )  # fmt: skip
+    name_colors(figure, {_NAMES[s]: _COLORS[s] for s in present})
     return figure
 
 
@@ -80,4 +77,4 @@ def _colored(light: np.ndarray, scan: Scan, camera: Camera, label: np.ndarray) -
 def _draw(axes: Axes, image: np.ndarray, aspect: float, title: str) -> None:
     axes.imshow(image, aspect=aspect, interpolation="antialiased")
     axes.set_axis_off()
-    axes.set_title(title, color=INK, fontsize=10)
+    axes.set_title(title, color=INK, fontsize=LABEL_PT)

@@ -2,72 +2,87 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize, to_rgb
+from matplotlib.colors import Normalize, SymLogNorm, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
-from vanejax.plotting.canvas import INK, new_figure
-from vanejax.plotting.deviation import DEVIATION_COLORMAP
+from vanejax.plotting.canvas import (
+    DEVIATION_COLORMAP,
+    INK,
+    LABEL_PT,
+    WIDTH_IN,
+    add_color_bar,
+    add_legend,
+    new_figure,
+)
 from vanejax.plotting.shading import crop
 from vanejax.scanner.measurement import Measurement, Reason
 
 REASON_COLORS = {
-    Reason.SHADOWED: "#3b3f46",
-    Reason.GRAZING: "#8a63c9",
-    Reason.SATURATED: "#f2c230",
-    Reason.DARK: "#2f9e8f",
-    Reason.LOST: "#b7bcc4",
-    Reason.OUT_OF_RANGE: "#e07a2f",
+    Reason.SHADOWED: INK,
+    Reason.GRAZING: "#882255",
+    Reason.SATURATED: "#e3c800",
+    Reason.DARK: "#6b8e00",
+    Reason.LOST: "#a9adb4",
+    Reason.OUT_OF_RANGE: "#0072b2",
 }
-_PANEL_IN = 2.9  # wide
+LINEAR_MM = 0.01  # colours are linear up to here, logarithmic beyond
 
 
 def measurements_picture(
-    measurements: Mapping[str, Measurement], *, limit_mm: float = 0.15, columns: int = 4
+    measurements: Mapping[str, Measurement], *, limit_mm: float = 1.0, columns: int = 4
 ) -> Figure:
     """A panel for each measurement by its title: what the camera's image shows of the part.
 
-    Measured pixels are coloured by how far their points stand off the true surface, outward, from
-    ``-limit_mm`` to ``limit_mm``; the others by the reason why they are not measured.
+    Measured pixels are coloured by how far their points stand off the true surface, outward, on one
+    scale from ``-limit_mm`` to ``limit_mm`` that shows hundredths and whole millimetres; the others
+    by the reason why they are not measured. Both figures stand in the titles.
     """
     columns = min(columns, len(measurements))
-    rows = math.ceil(len(measurements) / columns)
+    lines = -(-len(measurements) // columns)
     first = next(iter(measurements.values()))
-    down, across = crop(first.ideal, first.sensor.camera)
     camera = first.sensor.camera
+    down, across = crop(first.ideal, camera)
     high = (down.stop - down.start) / camera.fy / ((across.stop - across.start) / camera.fx)
-    figure = new_figure(_PANEL_IN * columns + 0.9, (_PANEL_IN * high + 0.35) * rows + 0.5)
-    panels = figure.subplots(rows, columns, squeeze=False)
-    scale = Normalize(-limit_mm, limit_mm)
+    width = (WIDTH_IN - 0.8) / columns
+    figure = new_figure(width * columns + 0.8, (width * high + 0.35) * lines + 0.3)
+    panels = figure.subplots(lines, columns, squeeze=False)
+    scale = SymLogNorm(LINEAR_MM, vmin=-limit_mm, vmax=limit_mm)
     for axes in panels.flat:
         axes.set_axis_off()
     for axes, (title, measurement) in zip(panels.flat, measurements.items(), strict=False):
         _draw(axes, measurement, scale)
-        axes.set_title(title, color=INK, fontsize=10, loc="left")
-    bar = figure.colorbar(
-        ScalarMappable(scale, DEVIATION_COLORMAP), ax=panels, shrink=0.6, pad=0.01, aspect=30
-    )
-    bar.set_label("off the true surface (mm)", color=INK, fontsize=9)
+        axes.set_title(
+            f"{title}\n{_figures(measurement)}", color=INK, fontsize=LABEL_PT, loc="left"
+        )
+    label = "distance from the true surface (mm), + outward"
+    colors = ScalarMappable(scale, DEVIATION_COLORMAP)
+    bar = add_color_bar(figure, panels, colors, label, shrink=0.7, aspect=35)
+    bar.ax.yaxis.set_major_formatter("{x:g}")
     seen = {Reason(reason) for m in measurements.values() for reason in np.unique(m.reason)}
     handles = [
-        panels[0, 0].scatter(
-            [], [], s=45, marker="s", color=color, label=reason.name.lower().replace("_", " ")
-        )
+        Patch(color=color, label=reason.name.lower().replace("_", " "))
         for reason, color in REASON_COLORS.items()
         if reason in seen
     ]
     if handles:
-        figure.legend(
-            handles=handles, loc="outside lower center", ncols=len(handles), frameon=False,
-            fontsize=10, labelcolor=INK,
-        )  # fmt: skip
+        add_legend(figure, handles, loc="outside lower center", ncols=len(handles),
+                   title="not measured:", title_fontsize=LABEL_PT)  # fmt: skip
     return figure
+
+
+def _figures(measurement: Measurement) -> str:
+    """Share of the pixels that are lost, and how far off the others are; what is zero is left."""
+    rms_mm = float(np.sqrt(np.mean(off_surface_mm(measurement) ** 2)))
+    lost = f"{measurement.hole_share:.1%} lost" if measurement.hole_share else ""
+    rms = f"rms {rms_mm:.2g} mm" if rms_mm > 1e-4 else ""  # less is rounding
+    return ", ".join(filter(None, (lost, rms))) or "no error"
 
 
 def error_image(measurement: Measurement, scale: Normalize) -> np.ndarray:

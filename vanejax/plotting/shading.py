@@ -59,7 +59,7 @@ def part_picture(scan: Scan, camera: Camera) -> Figure:
     rows, columns = crop(scan, camera)
     wide = (columns.stop - columns.start) / camera.fx
     high = (rows.stop - rows.start) / camera.fy
-    longest = 6.0 / max(high, wide)
+    longest = 5.0 / max(high, wide)
     figure = new_figure(longest * wide, longest * high)
     draw_part(figure.subplots(), scan, camera, image)
     return figure

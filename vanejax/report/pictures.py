@@ -12,8 +12,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
-from vanejax.plotting.canvas import FAINT, GRID, INK
-from vanejax.plotting.deviation import DEVIATION_COLORMAP
+from vanejax.plotting.canvas import DEVIATION_COLORMAP, FAINT, GRID, INK
 from vanejax.plotting.scene import Picture, scale_bar_mm
 
 _ON_DARK = {INK: "#e6e8eb", FAINT: "#8a8f98", GRID: "#33383f"}

@@ -22,7 +22,7 @@ from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.files import write_text
 from vanejax.localization.pose_result import PoseResult
-from vanejax.plotting.canvas import REFERENCE_RED, SOURCE_GREEN
+from vanejax.plotting.canvas import HIDDEN, SCAN
 from vanejax.plotting.clouds import seen_and_hidden
 from vanejax.plotting.deviation import color_limit_mm
 from vanejax.report.pictures import color_bar
@@ -39,7 +39,7 @@ _YAW_DEG, _PITCH_DEG = 28.0, 14.0
 _FRAMES_PER_STEP = 12
 # the viewer colours dots by deviation: here its two ends are the two colours
 _CODE_UM = 32_000
-_GREEN_AND_RED = np.repeat([(*to_rgb(c), 1.0) for c in (SOURCE_GREEN, REFERENCE_RED)], 128, axis=0)
+_SCAN_AND_HIDDEN = np.repeat([(*to_rgb(c), 1.0) for c in (SCAN, HIDDEN)], 128, axis=0)
 _NOISE_LIFT = 0.01  # radii: noise of a network's scans, which would hide half of the dots
 _DOT, _LARGEST_DOT = 0.45, 0.012  # spacings, radii: between the dots the part's shading shows
 
@@ -121,7 +121,7 @@ def scan_view(scan: Scan, part: Part, *, voxel_mm: float = 1.5) -> View3d:
     here = RigidTransform.identity(dtype=np.float64)
     scene = _scene(
         part, np.concatenate([seen, hidden]), [here, here], codes_um=codes,
-        colors=_GREEN_AND_RED,
+        colors=_SCAN_AND_HIDDEN,
         reader_from_part=_beside(scan.camera_from_part.rotation), lift_mm=0.002 * part.radius,
     )  # fmt: skip
     legend = [_Legend("scan", "seen"), _Legend("cad", "hidden by self-occlusion")]
@@ -175,7 +175,7 @@ def motion_view(
     stops = range(0, len(film), _FRAMES_PER_STEP)
     captions = [names[index // _FRAMES_PER_STEP] for index in range(len(film))]
     scene = _scene(
-        part, points, film, codes_um=np.full(len(points), -_CODE_UM), colors=_GREEN_AND_RED,
+        part, points, film, codes_um=np.full(len(points), -_CODE_UM), colors=_SCAN_AND_HIDDEN,
         reader_from_part=_beside(camera_from_part.rotation), lift_mm=_NOISE_LIFT * part.radius,
     )  # fmt: skip
     legend = [_Legend("scan", "scan"), _Legend("metal", "CAD")]

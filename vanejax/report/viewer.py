@@ -18,13 +18,8 @@ from scipy.spatial import cKDTree
 
 from vanejax.cad.part import Part
 from vanejax.localization.pose_result import PoseResult
-from vanejax.plotting.canvas import SOURCE_GREEN
-from vanejax.plotting.deviation import (
-    DEVIATION_COLORMAP,
-    NO_PARTNER,
-    color_limit_mm,
-    overlay_rotation,
-)
+from vanejax.plotting.canvas import DEVIATION_COLORMAP, NO_PARTNER, SCAN
+from vanejax.plotting.deviation import color_limit_mm, overlay_rotation
 from vanejax.rigid import RigidTransform
 from vanejax.scans.measured_scan import MeasuredScan
 
@@ -161,7 +156,7 @@ def scene_json(
         ],
         "limit_mm": limit_mm,
         "colors": to_base64(np.round(255 * colors), "u1"),
-        "scan_color": to_rgb(SOURCE_GREEN),
+        "scan_color": to_rgb(SCAN),
         "lost_color": to_rgb(NO_PARTNER),
     }
     # "<" could end the script element

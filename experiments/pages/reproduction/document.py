@@ -16,7 +16,7 @@ from typing import Any
 import jinja2
 from matplotlib.figure import Figure
 
-from experiments.pages.blocks import BLOCKS, GROUPS, PAPER_SERIES, block, other_series, series
+from experiments.pages.blocks import BLOCKS, GROUPS, block
 from experiments.pages.reproduction.claim import Results, Topic, Verdict
 from experiments.pages.reproduction.claims.networks import (
     ABLATIONS,
@@ -40,6 +40,7 @@ from experiments.studies.comparison import pictures as comparison_pictures
 from experiments.studies.density import report as density_report
 from experiments.studies.fine import study as fine
 from experiments.studies.position import report as position_report
+from experiments.studies.public_vs_virtual import study as public_vs_virtual
 from experiments.studies.robustness import report as robustness_report
 from experiments.studies.verdicts import report as verdict_report
 
@@ -64,18 +65,20 @@ TOPICS = {
     "clutter": CLUTTER,
     "speed": SPEED,
 }
-# by record: the picture that is drawn of it
+# by record, and by what of it where there are several: the picture that is drawn
 PICTURES: dict[str, Callable[[Any], Figure]] = {
     "density": lambda report: density_report.picture(report["sweeps"]),
     "comparison": comparison_pictures.error_shares,
+    "comparison/maps": comparison_pictures.error_maps,
+    "public_vs_virtual/hardest": lambda report: public_vs_virtual.picture(report, "hardest"),
+    "public_vs_virtual/all": lambda report: public_vs_virtual.picture(report, "all"),
     "ablation_neighbors": ablation_picture.picture,
     "ablation_noise": ablation_picture.picture,
-    "robustness": lambda report: robustness_report.picture(series(report, PAPER_SERIES)),
+    "robustness": robustness_report.picture,
     "position": position_report.picture,
     "fine": lambda report: fine.picture(report["levels"]),
     "verdicts": verdict_report.picture,
 }
-_BESIDE = 3  # series in one picture: more are too small on paper
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -151,23 +154,11 @@ def document(
     def picture(alt: str, caption: str, *, draw: str = "", **files: str) -> str:
         if not draw:
             return keep(Picture(alt, caption, **files))
-        if draw not in results:
+        record = draw.partition("/")[0]
+        if record not in results:
             return ""
-        drawn = functools.partial(PICTURES[draw], results[draw])
+        drawn = functools.partial(PICTURES[draw], results[record])
         return keep(Picture(alt, caption, **files, draw=drawn))
-
-    def series_pictures() -> str:
-        if "robustness" not in results:
-            return ""
-        names, made = other_series(results["robustness"]), []
-        # the short row comes first: castings stand beside castings
-        for end in range(len(names) % _BESIDE or _BESIDE, len(names) + 1, _BESIDE):
-            report = series(results["robustness"], names[max(0, end - _BESIDE) : end])
-            words = "; ".join(entry["title"].lower() for entry in report["series"])
-            draw = functools.partial(robustness_report.picture, report)
-            made.append(keep(Picture(f"Errors, FFMDE and RMSE over {words}",
-                                     f"Drawn as Fig. 11: {words}.", draw=draw)))  # fmt: skip
-        return "\n\n".join(made)
 
     def shown_block(name: str) -> str:
         records = [BLOCKS[part][0] for part in GROUPS.get(name, (name,))]
@@ -186,7 +177,6 @@ def document(
         summary=functools.partial(summary, results),
         section=lambda name: f"## {TOPICS[name].title}\n\n{judged(TOPICS[name], results)}",
         picture=picture,
-        series_pictures=series_pictures,
         block=shown_block,
         table=raw_table,
         provenance=lambda name: provenance(name, results[name]),

@@ -12,8 +12,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 from experiments.studies.ablation.table import CELL_TESTS, labels, shown, two_tests
-from vanejax.plotting.canvas import INK, new_figure, style_chart
-from vanejax.plotting.charts import SERIES
+from vanejax.plotting.canvas import (
+    MARKERS,
+    SERIES,
+    WIDTH_IN,
+    add_legend,
+    new_figure,
+    style_chart,
+)
 
 ERRORS = (
     ("rotation_error_deg", "rotation error (deg)"),
@@ -32,7 +38,7 @@ def picture(report: Mapping[str, Any]) -> Figure:
     tests = list(CELL_TESTS) if two_tests(points) else ["own"]
     cut = any("budget" in point["ended_by"] for point in points)
     name = labels(fields)[0] + (" (hollow: the budget ended the training)" if cut else "")
-    figure = new_figure(11.0, 0.4 + 3.6 * len(tests))
+    figure = new_figure(WIDTH_IN, 0.2 + 2.3 * len(tests))
     panels = figure.subplots(len(tests), len(ERRORS), squeeze=False)
     for row, test in zip(panels, tests, strict=True):
         for axes, (measure, label) in zip(row, ERRORS, strict=True):
@@ -47,10 +53,10 @@ def picture(report: Mapping[str, Any]) -> Figure:
                     for point in line
                     if point["tests"][test]
                 }
-                _draw(axes, spreads, SERIES[number % len(SERIES)], words)
+                _draw(axes, spreads, number % len(SERIES), words)
             _error_axis(axes)
     if len(fields) > 1:
-        panels[0, 0].legend(frameon=False, fontsize=9, labelcolor=INK)
+        add_legend(panels[0, 0])
     return figure
 
 
@@ -76,17 +82,18 @@ def _lines(
 
 
 def _draw(
-    axes: Axes, spreads: Mapping[float, tuple[Mapping[str, Any], bool]], color: str, label: str
+    axes: Axes, spreads: Mapping[float, tuple[Mapping[str, Any], bool]], number: int, label: str
 ) -> None:
     """One line; ``spreads`` has the spread over the seeds, and whether a budget ended one, by x."""
     known = sorted((x, *pair) for x, pair in spreads.items() if pair[0]["mean"] is not None)
-    x = [place for place, _, _ in known]
-    axes.plot(x, [spread["mean"] for _, spread, _ in known], color=color, label=label)
+    color, marker = SERIES[number], MARKERS[number]
+    x, means = [place for place, _, _ in known], [spread["mean"] for _, spread, _ in known]
+    axes.plot(x, means, f"{marker}-", color=color, label=label, linewidth=1.2, markersize=4)
     for place, spread, cut in known:
         axes.plot([place] * 2, [spread["min"], spread["max"]], color=color, linewidth=1.0)
-        axes.plot(
-            place, spread["mean"], "o", color=color, markerfacecolor="white" if cut else color
-        )
+        if cut:
+            hollow = {"markerfacecolor": "white", "markersize": 4}
+            axes.plot(place, spread["mean"], marker, color=color, **hollow)
 
 
 def _value_axis(axes: Axes, values: Sequence[Any]) -> dict[str, float]:

@@ -9,8 +9,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from vanejax.plotting.canvas import FAINT, INK, new_figure, style_chart
-from vanejax.plotting.charts import SERIES
+from vanejax.plotting.canvas import (
+    GRID,
+    INK,
+    MARKERS,
+    SERIES,
+    WIDTH_IN,
+    add_legend,
+    new_figure,
+    style_chart,
+)
 
 TITLES = {
     "rmse_mm": "RMSE",
@@ -56,17 +64,17 @@ def table(sweep: dict[str, Any]) -> str:
 def picture(sweeps: Sequence[dict[str, Any]]) -> Figure:
     """The metrics over the number of CAD points: a row for each noise, a line for each error."""
     rows = [sweep for sweep in sweeps if sweep["varied"] == "CAD"]
-    figure = new_figure(13.0, 3.3 * len(rows) + 0.6)
+    figure = new_figure(WIDTH_IN, 1.9 * len(rows) + 0.5)
     panels = figure.subplots(len(rows), len(TITLES), sharex=True, sharey="col", squeeze=False)
     for line, sweep in zip(panels, rows, strict=True):
         for axes, (name, title) in zip(line, TITLES.items(), strict=True):
-            style_chart(axes, title=f"{title}, {_noise(sweep)}")
+            style_chart(axes, title=f"{title}\n{_noise(sweep)}")
             mean, std = (np.array(sweep[name][key]) for key in ("mean", "std"))
             for e, error in enumerate(sweep["errors"]):
                 color = (INK, *SERIES)[e]
                 axes.plot(
-                    sweep["cad_points"], mean[:, e], "o-", color=color, markersize=3.5,
-                    linewidth=1.4, label=_pose(error),
+                    sweep["cad_points"], mean[:, e], f"{MARKERS[e]}-", color=color, markersize=2.8,
+                    linewidth=1.0, label=_pose(error),
                 )  # fmt: skip
                 # half of the mean at the lowest: a logarithm has no room for less than nothing
                 low = np.maximum(mean[:, e] - std[:, e], 0.5 * mean[:, e])
@@ -80,15 +88,11 @@ def picture(sweeps: Sequence[dict[str, Any]]) -> Figure:
             for axis in (axes.xaxis, axes.yaxis):
                 axis.set_major_formatter("{x:,g}")
                 axis.set_minor_formatter(NullFormatter())
-            axes.grid(axis="x", color=FAINT, alpha=0.25, linewidth=0.6)
-        line[0].set_ylabel("mm", color=INK, fontsize=10)
+            axes.grid(axis="x", color=GRID, linewidth=0.6)
+        line[0].set_ylabel("mm")
     for axes in panels[-1]:
-        axes.set_xlabel("points of the CAD sample", color=INK, fontsize=10)
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper center", ncols=len(labels), frameon=False,
-        labelcolor=INK,
-    )  # fmt: skip
+        axes.set_xlabel("points of the CAD sample")
+    add_legend(figure, loc="outside upper center", ncols=5, title="pose error:", title_fontsize=8)
     return figure
 
 

@@ -28,8 +28,19 @@ from experiments.runner.vane_views import VaneViews, magnitudes, perturb, pose_e
 from vanejax.localization.covariance import uncertainty
 from vanejax.localization.fine_registration import refine
 from vanejax.localization.residuals import RayCasting
-from vanejax.plotting.canvas import FAINT, INK, new_figure, save_figure, style_chart
-from vanejax.plotting.charts import SERIES
+from vanejax.plotting.canvas import (
+    FAINT,
+    INK,
+    OURS,
+    WIDTH_IN,
+    add_legend,
+    new_figure,
+    save_figure,
+    style_chart,
+)
+from vanejax.plotting.canvas import (
+    PAPER as PAPER_COLOR,
+)
 from vanejax.rigid import RigidTransform
 
 NOISE_MM = (0.05, 0.1, 0.2, 0.5, 1.0)
@@ -273,34 +284,36 @@ def basin_table(rows: Sequence[dict[str, Any]]) -> str:
 def picture(levels: Sequence[dict[str, Any]]) -> Figure:
     """Errors over noise with the bound as a line, and how often the ellipsoid holds the truth."""
     noise = [level["noise_mm"] for level in levels]
-    figure = new_figure(12.0, 3.8)
+    figure = new_figure(WIDTH_IN, 2.8)
     panels = figure.subplots(1, 3)
     for axes, name, unit in zip(panels, PAPER, ("deg", "mm"), strict=False):
         style_chart(
             axes, title=f"{name.split('_')[0]} error", xlabel="noise along the ray (mm)",
-            ylabel=unit,
+            ylabel=f"error ({unit})",
         )  # fmt: skip
         each = [[row[name] for row in level["rows"]] for level in levels]
         for x, values in zip(noise, each, strict=True):
             axes.plot([x] * len(values), values, ".", color=FAINT, markersize=3, alpha=0.5)
-        axes.plot(noise, [level[name]["bound"] for level in levels], color=INK, label="bound, rms")
+        axes.plot(noise, [level[name]["bound"] for level in levels], color=INK, label="bound")
         axes.plot(
-            noise, [level[name]["rms"] for level in levels], "o", color=SERIES[0], label="rms",
+            noise, [level[name]["rms"] for level in levels], "o", color=OURS, markersize=4,
+            label="ours, rms",
         )  # fmt: skip
-        axes.axhline(PAPER[name], color=SERIES[5], linestyle="--", label="paper, mean")
+        axes.axhline(PAPER[name], color=PAPER_COLOR, linestyle="--", label="paper, mean")
         _noise_axis(axes, noise)
         axes.set_yscale("log")
-        axes.legend(frameon=False, fontsize=9, labelcolor=INK)
     style_chart(
-        panels[2], title="truth inside the 95 % ellipsoid", xlabel="noise along the ray (mm)",
+        panels[2], title="truth in the 95 % ellipsoid", xlabel="noise along the ray (mm)",
         ylabel="share of the views",
     )  # fmt: skip
     low, high = levels[0]["coverage_interval_95"]
-    panels[2].axhspan(low, high, color=FAINT, alpha=0.25, linewidth=0, label="chance allows")
-    panels[2].plot(noise, [level["coverage_95"] for level in levels], "o-", color=SERIES[0])
+    panels[2].axhspan(low, high, color=FAINT, alpha=0.25, linewidth=0, label="95 % of chance")
+    shares = [level["coverage_95"] for level in levels]
+    panels[2].plot(noise, shares, "o-", color=OURS, markersize=4)
     _noise_axis(panels[2], noise)
     panels[2].set_ylim(0, 1.03)
-    panels[2].legend(frameon=False, fontsize=9, labelcolor=INK, loc="lower left")
+    add_legend(panels[2], loc="lower left")
+    add_legend(figure, loc="outside lower left", ncols=3)
     return figure
 
 

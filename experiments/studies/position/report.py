@@ -12,8 +12,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from experiments.runner import markdown
-from vanejax.plotting.canvas import FAINT, INK, REFERENCE_RED, new_figure, style_chart
-from vanejax.plotting.charts import SERIES
+from vanejax.plotting.canvas import (
+    INK,
+    SERIES,
+    TICK_PT,
+    WIDTH_IN,
+    add_legend,
+    new_figure,
+    style_chart,
+)
+from vanejax.plotting.canvas import (
+    PAPER as PAPER_COLOR,
+)
 
 Report = Mapping[str, Any]
 Rows = list[Report]
@@ -197,14 +207,14 @@ def _frames(report: Report) -> str:
 
 def picture(report: Report) -> Figure:
     """Fig. 15: errors at every position, the paper's figures, and what was predicted."""
-    figure = new_figure(12.5, 5.4)
+    figure = new_figure(WIDTH_IN, 4.2)
     turned, moved = figure.subplots(1, 2)
     first = report["cameras"][0]
     errors = magnitudes(report, turns_of, "error_deg")
     probe = magnitudes(report, moves_of, "against_probe_mm")
     style_chart(
         turned,
-        title=f"(a) angle about the R axis: {_summary(errors, 'deg')}",
+        title=f"(a) angle about the R axis\n{_summary(errors, 'deg')}",
         xlabel="turned by (deg)",
         ylabel="error (deg)",
     )
@@ -214,13 +224,13 @@ def picture(report: Report) -> Figure:
     _points(turned, errors, SERIES[0], "each camera")
     _means(turned, errors, SERIES[0], "-", "mean of the cameras")
     whole = magnitudes(report, turns_of, "whole_deg")
-    _means(turned, whole, SERIES[2], "--", "the whole rotation, mean")
+    _means(turned, whole, SERIES[2], "--", "whole rotation, mean of the cameras")
     _means(turned, sigma, INK, ":", "predicted (one sigma)")
     _levels(turned, PAPER["turns"], GOAL["turns"])
 
     style_chart(
         moved,
-        title=f"(b) translation, against the probe: {_summary(probe, 'mm')}",
+        title=f"(b) translation, against the probe\n{_summary(probe, 'mm')}",
         xlabel="moved along X, Y, Z by (mm)",
         ylabel="error (mm)",
     )
@@ -230,17 +240,14 @@ def picture(report: Report) -> Figure:
     _means(moved, probe, SERIES[0], "-", "against the probe, mean")
     for name, color, words in (
         ("against_truth_mm", SERIES[2], "against the truth, mean"),
-        ("known_frame_mm", SERIES[1], "the same, were the frame T_b known"),
-        ("origin_mm", SERIES[3], "eq. 13 as printed: at the machine's origin"),
+        ("known_frame_mm", SERIES[1], "the same with the true frame T_b"),
+        ("origin_mm", SERIES[3], "eq. 13 as printed (machine's origin)"),
     ):
         _means(moved, magnitudes(report, moves_of, name), color, "--", words)
     _means(moved, magnitudes(report, moves_of, "sigma_mm"), INK, ":", "predicted (one sigma)")
     _levels(moved, PAPER["moves"], GOAL["moves"])
     for axes in (turned, moved):
-        axes.legend(
-            frameon=False, fontsize=8.5, labelcolor=INK, ncols=2, loc="upper center",
-            bbox_to_anchor=(0.5, -0.2),
-        )  # fmt: skip
+        add_legend(axes, loc="upper center", bbox_to_anchor=(0.5, -0.27))
     return figure
 
 
@@ -252,14 +259,14 @@ def _points(axes: Axes, values: np.ndarray, color: str, label: str) -> None:
     """Every value [cameras, positions] as a dot."""
     places = np.broadcast_to(np.arange(values.shape[1]), values.shape)
     axes.plot(
-        places.ravel(), values.ravel(), "o", color=color, alpha=0.35, markersize=4, label=label,
+        places.ravel(), values.ravel(), "o", color=color, alpha=0.35, markersize=3, label=label,
         markeredgewidth=0,
     )  # fmt: skip
 
 
 def _means(axes: Axes, values: np.ndarray, color: str, line: str, label: str) -> None:
     """The mean of values [cameras, positions] over the cameras as a line."""
-    axes.plot(values.mean(axis=0), line, color=color, linewidth=1.6, label=label)
+    axes.plot(values.mean(axis=0), line, color=color, linewidth=1.2, label=label)
 
 
 def _levels(axes: Axes, paper: tuple[float, float], goal: float) -> None:
@@ -271,11 +278,11 @@ def _levels(axes: Axes, paper: tuple[float, float], goal: float) -> None:
         (paper[1], "--", "paper, maximum", "bottom"),
         (goal, "-.", "goal for the mean", "bottom"),
     ):
-        color = FAINT if words.startswith("goal") else REFERENCE_RED
+        color = INK if words.startswith("goal") else PAPER_COLOR
         axes.axhline(value, linestyle=line, color=color, linewidth=1.2)
         axes.text(
             left, value * (1.04 if side == "bottom" else 0.96), f" {words} {value:g}",
-            ha="left", va=side, color=color, fontsize=8.5,
+            ha="left", va=side, color=color, fontsize=TICK_PT,
         )  # fmt: skip
     axes.set_xlim(left)
     low, high = axes.get_ylim()

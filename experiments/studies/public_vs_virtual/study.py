@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from experiments.compare import figures, training_told
 from experiments.evaluate import registered
@@ -105,6 +106,28 @@ def public_vs_virtual(
         plotting.save_figure(plotting.axis_errors(series), workdir / f"axis_errors_{title}.png")
     print(table(report))
     return report
+
+
+def picture(report: Mapping[str, Any], views: str) -> Figure:
+    """The paper's Figs 8 and 9 of a record, which holds the errors' means only.
+
+    The picture shows the means over views and over axes of errors [V, 3]; the product of both over
+    the mean of all is such errors.
+
+    Args:
+      report: what public_vs_virtual.json holds.
+      views: "hardest" or "all".
+    """
+    series = {}
+    for source in (VIRTUAL, PUBLIC):
+        means = report[f"{views}_views"][source]
+        errors = [
+            np.outer(means[f"{name}_per_view_{unit}"], means[f"{name}_per_axis_{unit}"])
+            / np.mean(means[f"{name}_per_axis_{unit}"])
+            for name, unit in (("mre", "deg"), ("mte", "mm"))
+        ]
+        series[report["trained_on"][source]["title"]] = plotting.AxisErrors(*errors)
+    return plotting.axis_errors(series)
 
 
 def compared(results: Mapping[str, Results], test: ScanSet) -> dict[str, Any]:

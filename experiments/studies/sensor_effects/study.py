@@ -129,7 +129,8 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
         }
     report = study.header("the sensor's effects, one at a time", settings, views.part)
     report = study.save(settings.out, "sensor_effects", report | {"effects": rows})
-    save_figure(measurements_picture(taken), settings.out / "sensor_effects.png")
+    errors = {name: scan for name, scan in taken.items() if name != "ideal"}
+    save_figure(measurements_picture(errors), settings.out / "sensor_effects.png")
     print(table(report))
     return report
 

@@ -39,7 +39,18 @@ from experiments.studies.sensor_fit.sensor_statistics import (
 from vanejax.cad.part import load_part
 from vanejax.cad.surface import Surface
 from vanejax.localization.residuals import RayCasting
-from vanejax.plotting.canvas import FAINT, INK, REFERENCE_RED, new_figure, save_figure, style_chart
+from vanejax.plotting.canvas import (
+    DEVIATION_COLORMAP,
+    INK,
+    LABEL_PT,
+    SENSORS,
+    WIDTH_IN,
+    add_color_bar,
+    add_legend,
+    new_figure,
+    save_figure,
+    style_chart,
+)
 from vanejax.rigid import RigidTransform
 from vanejax.scanner import measurement
 from vanejax.scanner.camera import Camera, field_of_view_deg
@@ -280,34 +291,33 @@ def _cell(figure: str, value: float | None) -> str:
 
 def picture(scans: Sequence[RealScan], taken: Mapping[str, Sequence[Compared]]) -> Figure:
     """Two scans: residuals in the image, real and virtual, and how they are distributed."""
-    columns = {"real": "real", "ideal": "virtual, ideal", "all": "virtual, consumer_depth"}
+    columns = {"real": "real", "ideal": "ideal", "all": "consumer_depth"}
     names = [scan.name for scan in scans]
     chosen = [names.index(name) for name in SHOWN if name in names] or [0]
-    figure = new_figure(14.0, 3.2 * len(chosen))
-    panels = figure.subplots(len(chosen), 4, squeeze=False)
+    figure = new_figure(WIDTH_IN, 2.2 * len(chosen))
+    panels = figure.subplots(len(chosen), 4, squeeze=False, width_ratios=(1, 1, 1, 1.3))
     for row, number in zip(panels, chosen, strict=True):
-        for axes, (key, title) in zip(row, columns.items(), strict=False):
-            image = axes.imshow(taken[key][number].residual_mm, cmap="RdBu_r", vmin=-4, vmax=4)
-            axes.set_title(f"{names[number]}: {title}", color=INK, fontsize=10, loc="left")
-            axes.set_xticks([])
-            axes.set_yticks([])
-        figure.colorbar(image, ax=row[2], label="measured - predicted (mm)", shrink=0.8)
         style_chart(row[3], title="away from edges", xlabel="residual (mm)", ylabel="share per mm")
-        for key, color in (("real", INK), ("all", REFERENCE_RED), ("ideal", FAINT)):
-            scan = taken[key][number]
+        for axes, (key, sensor) in zip(row, columns.items(), strict=False):
+            scan, style = taken[key][number], SENSORS[sensor]
+            image = axes.imshow(scan.residual_mm, cmap=DEVIATION_COLORMAP, vmin=-4, vmax=4)
+            title = "real" if key == "real" else f"virtual, {sensor}"
+            axes.set_title(title, color=INK, fontsize=LABEL_PT, loc="left")
+            axes.set_axis_off()
             inner = scan.residual_mm[scan.edge_px > EDGE_PX]
             row[3].hist(
-                inner[np.isfinite(inner)],
-                bins=np.arange(-6, 6.1, 0.25),
-                density=True,
-                histtype="step",
-                color=color,
-                label=columns[key],
-                linewidth=1.5,
-            )
+                inner[np.isfinite(inner)], bins=np.arange(-6, 6.1, 0.25), density=True,
+                histtype="step", color=style.color, linestyle=style.line, label=sensor,
+                linewidth=1.2,
+            )  # fmt: skip
+        row[0].text(
+            -0.05, 0.5, names[number], transform=row[0].transAxes, rotation=90, ha="right",
+            va="center", color=INK, fontsize=LABEL_PT,
+        )  # fmt: skip
+        add_color_bar(figure, row[2], image, "measured - predicted (mm)", shrink=0.9)
         row[3].set_yscale("log")
         row[3].set_ylim(1e-3, 60)
-        row[3].legend(frameon=False, fontsize=8, labelcolor=INK, loc="upper left")
+    add_legend(row[3], loc="upper center", bbox_to_anchor=(0.5, -0.3))
     return figure
 
 
@@ -339,7 +349,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
         "sensor": values | {"correlation_px": full.correlation_px},
     }
     report = study.save(settings.out, "sensor_fit", report | figures)
-    save_figure(picture(scans, taken), settings.out / "real_scans.png", dpi=110)
+    save_figure(picture(scans, taken), settings.out / "real_scans.png")
     print(table(report))
     return report
 

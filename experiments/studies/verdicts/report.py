@@ -10,8 +10,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
-from vanejax.plotting.canvas import FAINT, INK, new_figure, style_chart
-from vanejax.plotting.charts import SERIES
+from vanejax.plotting.canvas import (
+    FAINT,
+    SERIES,
+    VERDICTS,
+    WIDTH_IN,
+    add_legend,
+    new_figure,
+    style_chart,
+)
 
 STATUSES = ("accepted", "ambiguous", "rejected")
 RIGHT, OTHER_PART = "right", "another part"
@@ -181,35 +188,33 @@ def table(report: Mapping[str, Any]) -> str:
 
 def picture(report: Mapping[str, Any]) -> Figure:
     """The ROC of each figure, and the verdicts by kind of pose."""
-    figure = new_figure(11.0, 4.4)
+    figure = new_figure(WIDTH_IN, 3.2)
     curves, bars = figure.subplots(1, 2)
-    for color, name in zip(SERIES, report["figures"], strict=False):
+    lines = ("-", "--", "-.", ":", (0, (1, 3)))
+    for color, line, name in zip(SERIES, lines, report["figures"], strict=False):
         found = report["figures"][name]
         label = f"{FIGURES[name]}: {found['auc']:.3f}"
         false_accepts, true_accepts = found["curve"]
-        curves.plot(false_accepts, true_accepts, color=color, label=label)
-    curves.plot([0, 1], [0, 1], ":", color=FAINT)
-    curves.legend(
-        loc="lower right", fontsize=8, labelcolor=INK, title="area under the curve",
-        title_fontsize=9, framealpha=0.9, edgecolor="none",
+        curves.plot(false_accepts, true_accepts, color=color, linestyle=line, label=label)
+    curves.plot([0, 1], [0, 1], color=FAINT, linewidth=0.8)
+    add_legend(
+        curves, loc="upper center", bbox_to_anchor=(0.5, -0.2), title="area under the curve",
+        title_fontsize=8,
     )  # fmt: skip
     style_chart(
-        curves, title="right against wrong poses", xlabel="wrong poses accepted",
-        ylabel="right poses accepted",
+        curves, title="right against wrong poses", xlabel="share of the wrong poses accepted",
+        ylabel="share of the right poses accepted",
     )  # fmt: skip
     kinds = report["verdicts_by_kind"]
     left = np.zeros(len(kinds))
     totals = np.array([sum(count[s] for s in STATUSES) for count in kinds.values()])
     names = [f"{kind} ({total})" for kind, total in zip(kinds, totals, strict=True)]
-    for color, status in zip((SERIES[2], SERIES[1], SERIES[5]), STATUSES, strict=True):
+    for status, color in VERDICTS.items():
         share = np.array([count[status] for count in kinds.values()]) / np.maximum(totals, 1)
         bars.barh(names, share, left=left, color=color, label=status)
         left += share
     bars.invert_yaxis()
     style_chart(bars, title="verdict by kind of pose", xlabel="share of the poses")
     bars.grid(False)
-    figure.legend(
-        *bars.get_legend_handles_labels(), loc="outside lower right", ncols=3, frameon=False,
-        labelcolor=INK,
-    )  # fmt: skip
+    add_legend(bars, loc="upper center", bbox_to_anchor=(0.4, -0.2), ncols=3)
     return figure
