@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -72,8 +73,12 @@ def measurements_picture(
         if reason in seen
     ]
     if handles:
-        add_legend(figure, handles, loc="outside lower center", ncols=len(handles),
-                   title="not measured:", title_fontsize=LABEL_PT)  # fmt: skip
+        blank = panels.size - len(measurements)
+        place: dict[str, Any] = {"loc": "center"}
+        if not blank:
+            place = {"loc": "outside lower center", "ncols": len(handles)}
+        add_legend(panels.flat[-1] if blank else figure, handles, title="not measured",
+                   title_fontsize=LABEL_PT, **place)  # fmt: skip
     return figure
 
 

@@ -301,7 +301,7 @@ def picture(scans: Sequence[RealScan], taken: Mapping[str, Sequence[Compared]]) 
         for axes, (key, sensor) in zip(row, columns.items(), strict=False):
             scan, style = taken[key][number], SENSORS[sensor]
             image = axes.imshow(scan.residual_mm, cmap=DEVIATION_COLORMAP, vmin=-4, vmax=4)
-            title = "real" if key == "real" else f"virtual, {sensor}"
+            title = "real" if key == "real" else f"virtual,\n{sensor}"
             axes.set_title(title, color=INK, fontsize=LABEL_PT, loc="left")
             axes.set_axis_off()
             inner = scan.residual_mm[scan.edge_px > EDGE_PX]
@@ -317,7 +317,7 @@ def picture(scans: Sequence[RealScan], taken: Mapping[str, Sequence[Compared]]) 
         add_color_bar(figure, row[2], image, "measured - predicted (mm)", shrink=0.9)
         row[3].set_yscale("log")
         row[3].set_ylim(1e-3, 60)
-    add_legend(row[3], loc="upper center", bbox_to_anchor=(0.5, -0.3))
+    add_legend(figure, row[3].get_legend_handles_labels()[0], loc="outside lower right", ncols=3)
     return figure
 
 
