@@ -1,12 +1,12 @@
-"""Times of all that vanejax does, each beside its peer and its limit on this machine.
+"""Times of vanejax, compared with other programs and with the limits of this machine.
 
 python -m experiments.benchmark [--only scan,step,refine] [--weights FILE] [--repeats 5] [--large]
 
-A figure stands beside peers, other programs that do the same, and beside limits, the least that it
-could take here: Embree's bare casts, the arithmetic at the rate of a large matrix product. All are
-measured in the same run, so that a slow or a busy machine cancels in the ratios. Times are medians
-with their range. Open3D, small_gicp and PyTorch come with `pip install '.[peers]'`; without them
-their figures are skipped with a word. Results: a table and benchmark.json in ``--out``.
+A time is compared with peers, other programs that do the same, and with limits, the least that it
+could take here: Embree's casts alone, or the arithmetic at the rate of a large matrix product. All
+are measured in the same run, so that a slow or busy machine cancels in the ratios. Times are
+medians with their range. Open3D, small_gicp and PyTorch come with `pip install '.[peers]'`; without
+them their times are skipped. Results: a table and benchmark.json in ``--out``.
 
 To add a benchmark, write a function that takes `Bench` and yields `Figure`s or `Series`, and name
 it in `BENCHMARKS`.
@@ -27,8 +27,7 @@ from experiments.benchmarks.evaluation import evaluation
 from experiments.benchmarks.network import inference, step
 from experiments.benchmarks.processes import command, start
 from experiments.benchmarks.registration import refine_against_casts, register_from
-from experiments.benchmarks.scaling import scaling
-from experiments.benchmarks.scaling_series import Series, scaling_table, summarize_scaling
+from experiments.benchmarks.scaling import Series, scaling, scaling_table, summarize_scaling
 from experiments.benchmarks.scanning import scan
 from experiments.benchmarks.timing import Bench, Figure, summarize, table
 from experiments.runner import machine
@@ -59,12 +58,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
         raise InputError(f"no benchmark {', '.join(unknown)}; there are {', '.join(BENCHMARKS)}")
     if settings.repeats < LEAST_REPEATS:
         print(f"note: the figures that count are medians of at least {LEAST_REPEATS} repeats")
-    bench = Bench(
-        repeats=settings.repeats,
-        seed=settings.seed,
-        weights=settings.weights,
-        large=settings.large,
-    )
+    bench = Bench(settings.repeats, settings.seed, settings.weights, settings.large)
     report = study.header("times, warm", settings, bench.views.part)
     rates = machine.flops_per_second(LEAST_REPEATS)
     report["machine"]["matmul_flops_per_second"] = float(np.median(rates))
@@ -87,16 +81,13 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
 def headline(report: dict[str, Any]) -> str:
     """The machine and the versions, in words."""
     facts = report["machine"]
-    there = [f"{name} {version}" for name, version in report["versions"].items() if version]
-    halves = there[: len(there) // 2], there[len(there) // 2 :]
-    return "\n".join(
-        [
-            f"{facts['cpu']}, {facts['cores']} cores, "
-            f"{facts['matmul_flops_per_second'] / 1e9:.0f} GFLOP/s in a large f32 product, "
-            f"load {facts['load']:.1f} at the start",
-            *(", ".join(half) for half in halves),
-            "",
-        ]
+    installed = [f"{name} {version}" for name, version in report["versions"].items() if version]
+    half = len(installed) // 2
+    return (
+        f"{facts['cpu']}, {facts['cores']} cores, "
+        f"{facts['matmul_flops_per_second'] / 1e9:.0f} GFLOP/s in a large f32 product, load "
+        f"{facts['load']:.1f} at the start\n{', '.join(installed[:half])}\n"
+        f"{', '.join(installed[half:])}\n"
     )
 
 

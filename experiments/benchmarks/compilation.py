@@ -7,13 +7,12 @@ prints the seconds to trace and to compile as JSON; `VANEJAX_CACHE_DIR` is where
 
 from __future__ import annotations
 
+import functools
 import json
-import tempfile
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
-from experiments.benchmarks.processes import output
+from experiments.benchmarks.processes import first_and_later, measured
 from experiments.benchmarks.timing import Bench, Figure
 from experiments.benchmarks.vane_pairs import VanePairs
 from vanejax import compilation_cache
@@ -26,17 +25,7 @@ def compilation(bench: Bench) -> Iterator[Figure]:
 
     A later process traces the step again, which no cache spares: that stands by itself.
     """
-    cold, cached = [], []
-    with tempfile.TemporaryDirectory() as folder:
-        for repeat in range(bench.repeats):
-            cache = str(Path(folder) / str(repeat))
-            for times in (cold, cached):
-                text = output(
-                    ["-m", "experiments.benchmarks.compilation"],
-                    VANEJAX_CACHE_DIR=cache,
-                    TF_CPP_MIN_LOG_LEVEL="3",
-                )
-                times.append(json.loads(text))
+    cold, cached = first_and_later(bench.repeats, functools.partial(measured, "compilation"))
     yield Figure("tracing of a step, every process", [entry["trace"] for entry in cold + cached])
     first = [entry["trace"] + entry["compile"] for entry in cold]
     note = "traced and compiled"

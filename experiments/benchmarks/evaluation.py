@@ -8,6 +8,7 @@ prints the seconds as JSON; the weights are random, which costs as much as train
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import json
 import sys
@@ -19,7 +20,7 @@ from pathlib import Path
 from experiments import evaluate
 from experiments.benchmarks.flops import feature_flops, inference_flops
 from experiments.benchmarks.network import arithmetic
-from experiments.benchmarks.processes import output
+from experiments.benchmarks.processes import first_and_later, measured
 from experiments.benchmarks.timing import Bench, Figure
 from experiments.configs.vane import get_config
 from experiments.runner import evaluation_pictures as pictures
@@ -33,19 +34,11 @@ from vanejax.training.train_step import init_state, make_optimizer
 def evaluation(bench: Bench) -> Iterator[Figure]:
     """The default recipe's, with an empty compilation cache, then with a full one."""
     scans = test_scans(bench)
-    first, later = [], []
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "scans.npz"
+        path = f"{folder}/scans.npz"
         scans.save(path)
-        for repeat in range(bench.repeats):
-            cache = str(Path(folder) / str(repeat))
-            for times in (first, later):
-                text = output(
-                    ["-m", "experiments.benchmarks.evaluation", str(path)],
-                    VANEJAX_CACHE_DIR=cache,
-                    TF_CPP_MIN_LOG_LEVEL="3",
-                )
-                times.append(json.loads(text))
+        call = functools.partial(measured, "evaluation", path)
+        first, later = first_and_later(bench.repeats, call)
     config = get_config()
     model, sources = config.make_network().model, config.pair_sampling(scans).num_source
     targets, iterations = config.data.num_reference, config.model.test_iterations

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from experiments.benchmarks.flops import inference_flops, step_flops
-from experiments.benchmarks.timing import Bench, Figure
+from experiments.benchmarks.timing import Bench, Figure, peer
 from experiments.benchmarks.vane_pairs import VanePairs
 from experiments.runner import machine
 from vanejax.matching import fast_rpmnet
@@ -113,15 +113,12 @@ def registering(pairs: VanePairs) -> Callable[[], RigidTransform]:
     return lambda: jax.block_until_ready(infer(variables, pair.source, pair.target, features))
 
 
-def torch_step(bench: Bench, pairs: VanePairs) -> Figure:
+@peer("PyTorch, training step")
+def torch_step(bench: Bench, pairs: VanePairs) -> tuple[list[float], str]:
     """The published step: each pair with its own reference, the published loss."""
-    name = "PyTorch, training step"
-    try:
-        import torch
+    import torch
 
-        from experiments.benchmarks import torch_rpmnet
-    except ImportError as error:
-        return Figure(name, [], note=f"skipped: {error}")
+    from experiments.benchmarks import torch_rpmnet
 
     model = torch_rpmnet.TorchRpmNet(num_neighbors=pairs.neighbors)
     batch = [pairs.pair(seed) for seed in range(pairs.batch)]
@@ -130,24 +127,21 @@ def torch_step(bench: Bench, pairs: VanePairs) -> Figure:
     one = torch_rpmnet.make_train_step(model, iterations=iterations)
     seconds, loss = bench.time(lambda: one(*tensors))
     note = f"a reference for each pair, {torch.get_num_threads()} threads, loss {loss:.3f}"
-    return Figure(name, seconds, note=note)
+    return seconds, note
 
 
-def torch_inference(bench: Bench, pairs: VanePairs) -> Figure:
+@peer("PyTorch, inference")
+def torch_inference(bench: Bench, pairs: VanePairs) -> tuple[list[float], str]:
     """The published registration: features of both clouds in each iteration."""
-    name = "PyTorch, inference"
-    try:
-        import torch
+    import torch
 
-        from experiments.benchmarks import torch_rpmnet
-    except ImportError as error:
-        return Figure(name, [], note=f"skipped: {error}")
+    from experiments.benchmarks import torch_rpmnet
 
     model = torch_rpmnet.TorchRpmNet(num_neighbors=pairs.neighbors)
     source, target, _ = (torch.tensor(array[None]) for array in _arrays(pairs.pair(0)))
     with torch.no_grad():
         seconds, _ = bench.time(lambda: model(source, target, TEST_ITERATIONS))
-    return Figure(name, seconds, note=f"{torch.get_num_threads()} threads")
+    return seconds, f"{torch.get_num_threads()} threads"
 
 
 def _arrays(pair: Pair) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import functools
+import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from experiments.benchmarks.timing import Bench, Figure
 from vanejax.errors import InputError
 from vanejax.files import write_json
 from vanejax.machine.pose_file import pose_to_dict
 from vanejax.scans.scan_file import save_points
+
+T = TypeVar("T")
 
 
 def start(bench: Bench) -> Iterator[Figure]:
@@ -45,19 +50,31 @@ def command(bench: Bench) -> Iterator[Figure]:
         if bench.weights is not None:
             arguments += ["--weights", str(bench.weights.absolute())]
         for words, more in (("rough pose", ["--init", str(guess)]), ("any pose", [])):
-            first, second = [], []
-            for repeat in range(bench.repeats):
-                cache = str(Path(folder) / f"cache {words} {repeat}")
-                for seconds in (first, second):
-                    seconds.append(run([*arguments, *more], VANEJAX_CACHE_DIR=cache))
+            runs = first_and_later(bench.repeats, functools.partial(run, [*arguments, *more]))
             with_weights = "" if bench.weights is None else "weights, "
-            for turn, seconds, goal_s in (("first", first, 8.0), ("second", second, 5.0)):
+            for turn, seconds, goal_s in zip(("first", "second"), runs, (8.0, 5.0), strict=True):
                 yield Figure(
                     f"command, {with_weights}{words}, {turn} run",
                     seconds,
                     limits={"python -c 'import jax'": None},
                     goal_s=goal_s if words == "rough pose" else None,
                 )
+
+
+def first_and_later(repeats: int, call: Callable[..., T]) -> tuple[list[T], list[T]]:
+    """What a process gives with an empty compilation cache, and once more with the full one."""
+    first, later = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for repeat in range(repeats):
+            for results in (first, later):
+                results.append(call(VANEJAX_CACHE_DIR=f"{folder}/{repeat}"))
+    return first, later
+
+
+def measured(module: str, *arguments: str, **environment: str) -> dict[str, float]:
+    """The JSON that a module of the benchmarks prints, run as a process."""
+    words = ["-m", f"experiments.benchmarks.{module}", *arguments]
+    return json.loads(output(words, TF_CPP_MIN_LOG_LEVEL="3", **environment))
 
 
 def run(arguments: Sequence[str], **environment: str) -> float:

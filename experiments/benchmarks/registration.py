@@ -10,7 +10,7 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from experiments.benchmarks.other_icp import OPEN3D_ICP, SMALL_GICP, open3d_icp, small_gicp_icp
+from experiments.benchmarks.peers import OPEN3D_ICP, SMALL_GICP, open3d_icp, small_gicp_icp
 from experiments.benchmarks.timing import Bench, Figure
 from vanejax.cad.part import Part
 from vanejax.localization.fine_registration import refine

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,9 @@ import numpy as np
 import trimesh
 
 from experiments.benchmarks.network import registering, training
-from experiments.benchmarks.scaling_series import Series
-from experiments.benchmarks.timing import NOISE_MM, Bench
+from experiments.benchmarks.timing import NOISE_MM, Bench, shown
 from experiments.benchmarks.vane_pairs import VanePairs
+from experiments.runner import study_command as study
 from experiments.runner.vane_views import VaneViews, with_noise
 from vanejax.cad.part import Part, load_part
 from vanejax.localization.fine_registration import refine
@@ -27,26 +27,28 @@ from vanejax.scans.scan_file import load_scan, save_points
 
 
 @dataclasses.dataclass(frozen=True)
+class Series:
+    """The times of one operation (``seconds`` of each repeat) at ascending ``sizes``."""
+
+    name: str
+    unit: str
+    sizes: Sequence[float]
+    seconds: Sequence[Sequence[float]]
+
+
+@dataclasses.dataclass(frozen=True)
 class Sizes:
-    """What the series run over; the defaults are those of every run.
+    """What the series run over."""
 
-    Attributes:
-      edge_pieces: into which each edge of the vane's 22,976 faces is cut.
-      resolutions: of the camera, per side.
-      points: of the scan.
-      network_points: of the source and of the reference.
-      neighbors: of the network.
-      batches: of training.
-    """
-
-    edge_pieces: tuple[int, ...] = (1, 2, 4)
-    resolutions: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0)
+    edge_pieces: tuple[int, ...] = (1, 2, 4)  # of each edge of the vane's 22,976 faces
+    resolutions: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0)  # of the camera, per side
     points: tuple[int, ...] = (10_000, 30_000, 100_000, 300_000)
     network_points: tuple[int, ...] = (256, 512, 1024)
     neighbors: tuple[int, ...] = (16, 32, 64)
     batches: tuple[int, ...] = (1, 2, 4)
 
 
+FITTED = 3  # the largest sizes: in small ones the fixed costs prevail
 # to 10,132,416 faces, 84 M pixels, 10 M points: minutes
 LARGE = Sizes(
     edge_pieces=(1, 2, 4, 7, 12, 21),
@@ -62,35 +64,46 @@ def scaling(bench: Bench, sizes: Sizes | None = None) -> Iterator[Series]:
     """All series."""
     sizes = sizes or (LARGE if bench.large else Sizes())
     yield from over_faces(bench, sizes.edge_pieces)
-    yield over_resolution(bench, sizes.resolutions)
+    yield from over_resolution(bench, sizes.resolutions)
     yield from over_points(bench, sizes.points)
     yield from over_network(bench, sizes)
+
+
+def over(
+    unit: str,
+    sizes: Sequence[float],
+    runs_of: Callable[[Any], Mapping[str, Callable[[], Any]]],
+    time: Callable[[Callable[[], Any]], list[float]],
+) -> Iterator[Series]:
+    """A series for each of the runs that there are of every size."""
+    seconds: dict[str, list[list[float]]] = {}
+    for size in sizes:
+        for name, run in runs_of(size).items():
+            seconds.setdefault(name, []).append(time(run))
+    for name, times in seconds.items():
+        yield Series(name, unit, sizes, times)
 
 
 def over_faces(bench: Bench, edge_pieces: tuple[int, ...]) -> Iterator[Series]:
     """Reading, setting up, scanning and registering one part of more and more faces."""
     camera, pose = bench.views.camera, bench.views.viewpoints.view(bench.view)
-    counts: list[int] = []
-    seconds: dict[str, list[list[float]]] = {}
+    pieces_of = {len(bench.views.part.mesh.faces) * pieces**2: pieces for pieces in edge_pieces}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "part.stl"
-        for pieces in edge_pieces:
-            part = refined(bench.views.part, pieces)
+
+        def runs_of(faces: int) -> dict[str, Callable[[], Any]]:
+            part = refined(bench.views.part, pieces_of[faces])
             part.export(path)
-            scanner = Scanner(part)
-            counts.append(len(part.mesh.faces))
-            runs: dict[str, Callable[[], Any]] = {
+            return {
                 "load a binary STL": functools.partial(load_part, path, units="mm"),
                 "set up the scanner": functools.partial(Scanner, part),
-                "one scan, faces": functools.partial(scanner.scan, camera, pose),
+                "one scan, faces": functools.partial(Scanner(part).scan, camera, pose),
                 "register from a rough pose, faces": functools.partial(
                     register, bench.scan, part, init=bench.rough
                 ),
             }
-            for name, run in runs.items():
-                seconds.setdefault(name, []).append(bench.time_sparingly(run))
-    for name, times in seconds.items():
-        yield Series(name, "faces", counts, times)
+
+        yield from over("faces", list(pieces_of), runs_of, bench.time_sparingly)
 
 
 def refined(part: Part, pieces: int) -> Part:
@@ -108,39 +121,37 @@ def refined(part: Part, pieces: int) -> Part:
     return dataclasses.replace(part, mesh=mesh, notes=())
 
 
-def over_resolution(bench: Bench, resolutions: tuple[float, ...]) -> Series:
+def over_resolution(bench: Bench, resolutions: tuple[float, ...]) -> Iterator[Series]:
     """One scan with more and more pixels."""
     scanner, pose = bench.views.model.scanner, bench.views.viewpoints.view(bench.view)
     cameras = [bench.views.camera.scaled(factor) for factor in resolutions]
-    seconds = [
-        bench.time_sparingly(functools.partial(scanner.scan, camera, pose)) for camera in cameras
-    ]
-    return Series(
-        "one scan, pixels", "pixels", [camera.width * camera.height for camera in cameras], seconds
-    )
+    camera_of = {camera.width * camera.height: camera for camera in cameras}
+
+    def runs_of(pixels: int) -> dict[str, Callable[[], Any]]:
+        return {"one scan, pixels": functools.partial(scanner.scan, camera_of[pixels], pose)}
+
+    yield from over("pixels", list(camera_of), runs_of, bench.time_sparingly)
 
 
 def over_points(bench: Bench, counts: tuple[int, ...]) -> Iterator[Series]:
     """Reading, refining and registering more and more measured points of one view."""
     part, start = bench.views.part, bench.rough
-    seconds: dict[str, list[list[float]]] = {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scan.ply"
-        for count in counts:
+
+        def runs_of(count: int) -> dict[str, Callable[[], Any]]:
             points = measured_points(bench, count)
             save_points(path, points)
             scan = MeasuredScan(points, None, np.zeros(3), f"{count} points")
-            runs: dict[str, Callable[[], Any]] = {
+            return {
                 "read a scan, points": functools.partial(load_scan, path),
                 "refine, points": functools.partial(refine, bench.views.model, points, start),
                 "register from a rough pose, points": functools.partial(
                     register, scan, part, init=start
                 ),
             }
-            for name, run in runs.items():
-                seconds.setdefault(name, []).append(bench.time_sparingly(run))
-    for name, times in seconds.items():
-        yield Series(name, "points", counts, times)
+
+        yield from over("points", counts, runs_of, bench.time_sparingly)
 
 
 def measured_points(bench: Bench, count: int) -> np.ndarray:
@@ -154,30 +165,58 @@ def measured_points(bench: Bench, count: int) -> np.ndarray:
 
 
 def over_network(bench: Bench, sizes: Sizes) -> Iterator[Series]:
-    """RPM-Net of more and more points, neighbours and pairs."""
-    for name, unit, values, make, prepare in (
-        (
-            "inference, points of each cloud",
-            "points",
-            sizes.network_points,
-            lambda size: VanePairs(sources=size, targets=size),
-            registering,
-        ),
-        (
-            "inference, neighbours",
-            "neighbours",
-            sizes.neighbors,
-            lambda size: VanePairs(neighbors=size),
-            registering,
-        ),
-        (
-            "training step, pairs of a batch",
-            "pairs",
-            sizes.batches,
-            lambda size: VanePairs(batch=size),
-            training,
-        ),
-    ):
-        # the first run compiles, so that it never counts
-        seconds = [bench.time(prepare(make(value)))[0] for value in values]
-        yield Series(name, unit, values, seconds)
+    """RPM-Net of more and more points, neighbours and pairs; the first run of each compiles."""
+
+    def time(run: Callable[[], Any]) -> list[float]:
+        return bench.time(run)[0]
+
+    def points(size: int) -> dict[str, Callable[[], Any]]:
+        pairs = VanePairs(sources=size, targets=size)
+        return {"inference, points of each cloud": registering(pairs)}
+
+    def neighbors(size: int) -> dict[str, Callable[[], Any]]:
+        return {"inference, neighbours": registering(VanePairs(neighbors=size))}
+
+    def batches(size: int) -> dict[str, Callable[[], Any]]:
+        return {"training step, pairs of a batch": training(VanePairs(batch=size))}
+
+    yield from over("points", sizes.network_points, points, time)
+    yield from over("neighbours", sizes.neighbors, neighbors, time)
+    yield from over("pairs", sizes.batches, batches, time)
+
+
+def exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float | None:
+    """The slope of log time over log size at the largest sizes: 1 is linear, 2 quadratic.
+
+    None for fewer than two sizes.
+    """
+    if len(sizes) < 2:
+        return None
+    x, y = (np.log(values[-FITTED:]) for values in (sizes, seconds))
+    return float(np.polyfit(x, y, 1)[0])
+
+
+def summarize_scaling(series: Sequence[Series]) -> list[dict[str, Any]]:
+    """For JSON: each size with its times, and the exponent of the medians."""
+    rows = []
+    for entry in series:
+        points = [
+            {"size": size, "seconds": study.spread(list(seconds)), "repeats": len(seconds)}
+            for size, seconds in zip(entry.sizes, entry.seconds, strict=True)
+        ]
+        power = exponent(entry.sizes, [point["seconds"]["median"] for point in points])
+        rows.append({"name": entry.name, "unit": entry.unit, "points": points, "exponent": power})
+    return rows
+
+
+def scaling_table(rows: Sequence[dict[str, Any]]) -> str:
+    """The rows as aligned text."""
+    lines = [f"{'scaling':<46}{'median (s)':>11}{'min - max':>20}"]
+    for row in rows:
+        power = "" if row["exponent"] is None else f": grows as size^{row['exponent']:.2f}"
+        lines.append(f"{row['name']}{power}")
+        for point in row["points"]:
+            median, least, most = (shown(point["seconds"][k]) for k in ("median", "min", "max"))
+            size = f"{point['size']:,.0f} {row['unit']}"
+            lines.append(f"{size:>46}{median:>11}{f'{least} - {most}':>20}")
+    return "\n".join(lines)

@@ -9,7 +9,7 @@ import numpy as np
 from embreex.rtcore_scene import EmbreeScene
 
 from experiments.benchmarks.registration import bare_scene
-from experiments.benchmarks.timing import Bench, Figure
+from experiments.benchmarks.timing import Bench, Figure, peer
 from experiments.runner import machine
 from vanejax.cad.part import Part
 from vanejax.rigid import RigidTransform
@@ -43,12 +43,10 @@ def scan(bench: Bench) -> Iterator[Figure]:
     )
 
 
-def open3d_scan(bench: Bench, sample: range, scale: float, stated: str) -> Figure:
+@peer(OPEN3D)
+def open3d_scan(bench: Bench, sample: range, scale: float, stated: str) -> tuple[list[float], str]:
     """The same with Open3D, which uses all cores for each view."""
-    try:
-        import open3d
-    except ImportError as error:
-        return Figure(OPEN3D, [], note=f"skipped: {error}")
+    import open3d
 
     part, camera = bench.views.part, bench.views.camera
     scene = open3d.t.geometry.RaycastingScene()
@@ -69,7 +67,7 @@ def open3d_scan(bench: Bench, sample: range, scale: float, stated: str) -> Figur
 
     seconds, found = bench.time(lambda: [len(cast(view)[0]) for view in sample])
     note = f"rays, casts, points, normals, faces; {stated}; {scale * sum(found) / 1e6:.1f} M points"
-    return Figure(OPEN3D, [scale * spent for spent in seconds], note=note)
+    return [scale * spent for spent in seconds], note
 
 
 def bare_casts(bench: Bench, sample: range, scale: float, stated: str) -> Figure:

@@ -1,4 +1,4 @@
-"""How things are timed: what all timings share, repeats, peers and limits, a table."""
+"""Timing: the scan that is timed, repeats, peers and limits, and the table."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ PIXELS = 128  # across, of the scans that are only counted
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """One thing timed.
+    """The times of one operation.
 
     Attributes:
-      name: of it, unique.
+      name: unique.
       seconds: of each repeat, warm unless the note says otherwise; empty where it was skipped.
-      peers: names of figures of other programs that do the same; with each, how many times faster
-        than it this is to be, or None where nothing is asked.
-      limits: names of figures that are the least this could take; with each, how many times as
+      peers: figures of other programs that do the same, by name; with each, how many times as fast
+        this should be, or None for no goal.
+      limits: figures of the least time that this could take, by name; with each, how many times as
         long this may take, or None.
-      goal_s: what the median should not exceed on two cores.
-      note: what else there is to say, such as the pose's error, or why it was skipped.
+      goal_s: upper bound of the median on two cores.
+      note: such as the pose's error, or why it was skipped.
     """
 
     name: str
@@ -44,6 +44,26 @@ class Figure:
     limits: Mapping[str, float | None] = dataclasses.field(default_factory=dict)
     goal_s: float | None = None
     note: str = ""
+
+
+def peer(name: str) -> Callable[..., Callable[..., Figure]]:
+    """Makes a figure of a function that times another program: seconds and note.
+
+    Where the program is not installed, the figure has no seconds and says so.
+    """
+
+    def decorate(function: Callable[..., tuple[Sequence[float], str]]) -> Callable[..., Figure]:
+        @functools.wraps(function)
+        def figure(*arguments: Any) -> Figure:
+            try:
+                seconds, note = function(*arguments)
+            except ImportError as error:
+                return Figure(name, [], note=f"skipped: {error}")
+            return Figure(name, seconds, note=note)
+
+        return figure
+
+    return decorate
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,10 +1,10 @@
-"""RPM-Net in PyTorch, computed as its published code does: what vanejax is as fast as, or faster.
+"""RPM-Net in PyTorch, computed as its published code does: the peer of the network's times.
 
-Written anew after Yew and Lee, *RPM-Net* (CVPR 2020), with the structure and the names of the
-weights of their code: the features of both clouds anew in each iteration, neighbours by a sort of
-all indices, each pair of a batch with a reference of its own. Needs ``pip install vanejax[peers]``.
+Written anew after Yew and Lee, *RPM-Net* (CVPR 2020), with the structure and the weight names of
+their code: the features of both clouds anew in each iteration, neighbours by a sort of all indices,
+each pair of a batch with its own reference. Needs ``pip install vanejax[peers]``.
 
-Clouds are [B, N, 6]: coordinates and unit normals.
+Clouds are [B, N, 6]: coordinates and unit normals. Motions are [B, 3, 4].
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ import itertools
 from collections.abc import Callable, Sequence
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn import functional
 
 _EPSILON = 1e-5
 
 
-def square_distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def square_distance(a: Tensor, b: Tensor) -> Tensor:
     """[B, N, M] squared distances of a [B, N, C] and b [B, M, C]."""
     product = -2 * torch.matmul(a, b.transpose(1, 2))
     return product + (a**2).sum(-1)[:, :, None] + (b**2).sum(-1)[:, None, :]
 
 
-def ball_query(xyz: torch.Tensor, radius: float, num_neighbors: int) -> torch.Tensor:
-    """[B, N, K] the first other points by index within the radius, filled up by the point."""
+def ball_query(xyz: Tensor, radius: float, num_neighbors: int) -> Tensor:
+    """[B, N, K] the first other points by index within the radius, padded with the point itself."""
     batch, count, _ = xyz.shape
     itself = torch.arange(count)
     index = itself.repeat(batch, count, 1)
@@ -36,32 +36,23 @@ def ball_query(xyz: torch.Tensor, radius: float, num_neighbors: int) -> torch.Te
     return torch.where(index == count, itself[None, :, None], index)
 
 
-def gather(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-    """Values [B, N, C] at indices [B, N, K]: [B, N, K, C]."""
-    return values[torch.arange(len(values))[:, None, None], index]
-
-
-def angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def angle(a: Tensor, b: Tensor) -> Tensor:
     """Angles [...] between vectors [..., 3], radians."""
     a, b = torch.broadcast_tensors(a, b)
     return torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(-1))
 
 
 def stack(
-    widths: Sequence[int], layer: Callable[..., nn.Module], groups: int, *, bare_end: bool
+    widths: Sequence[int], layer: type[nn.Module], groups: int, *, plain_end: bool
 ) -> nn.Sequential:
-    """Layers with group normalisation and ReLU; a bare end has neither."""
+    """Dense layers with group normalisation and ReLU; a plain end has neither."""
+    size = () if layer is nn.Linear else (1,)  # a convolution of one point is a dense layer
     modules: list[nn.Module] = []
     for place, (before, after) in enumerate(itertools.pairwise(widths)):
-        modules.append(layer(before, after))
-        if not (bare_end and place == len(widths) - 2):
+        modules.append(layer(before, after, *size))
+        if not (plain_end and place == len(widths) - 2):
             modules += [nn.GroupNorm(groups, after), nn.ReLU()]
     return nn.Sequential(*modules)
-
-
-def convolution(kind: type[nn.Module]) -> Callable[[int, int], nn.Module]:
-    """A dense layer on every point, as the published code writes it."""
-    return lambda before, after: kind(before, after, 1)
 
 
 class FeatureNet(nn.Module):
@@ -70,15 +61,16 @@ class FeatureNet(nn.Module):
     def __init__(self, radius: float, num_neighbors: int) -> None:
         super().__init__()
         self.radius, self.num_neighbors = radius, num_neighbors
-        self.prepool = stack((10, 96, 96, 192), convolution(nn.Conv2d), 8, bare_end=False)
-        self.postpool = stack((192, 192, 96, 96), convolution(nn.Conv1d), 8, bare_end=True)
+        self.prepool = stack((10, 96, 96, 192), nn.Conv2d, 8, plain_end=False)
+        self.postpool = stack((192, 192, 96, 96), nn.Conv1d, 8, plain_end=True)
 
-    def forward(self, cloud: torch.Tensor) -> torch.Tensor:
+    def forward(self, cloud: Tensor) -> Tensor:
         """From clouds [B, N, 6]."""
         xyz, normals = cloud.split(3, dim=-1)
         index = ball_query(xyz, self.radius, self.num_neighbors)
-        offsets = gather(xyz, index) - xyz[:, :, None]
-        theirs, mine = gather(normals, index), normals[:, :, None]
+        batch = torch.arange(len(xyz))[:, None, None]
+        offsets = xyz[batch, index] - xyz[:, :, None]
+        theirs, mine = normals[batch, index], normals[:, :, None]
         pairs = [angle(mine, offsets), angle(theirs, offsets), angle(mine, theirs)]
         ppf = torch.stack([*pairs, offsets.norm(dim=-1)], dim=-1)
         x = torch.cat([xyz[:, :, None].expand_as(offsets), offsets, ppf], dim=-1)
@@ -88,28 +80,25 @@ class FeatureNet(nn.Module):
 
 
 class ParameterNet(nn.Module):
-    """Annealing parameters beta [B] and alpha [B] of two clouds."""
+    """Annealing parameters beta and alpha, [B, 2], of two clouds."""
 
     def __init__(self) -> None:
         super().__init__()
-        narrow = stack((4, 64, 64, 64, 128), convolution(nn.Conv1d), 8, bare_end=False)
-        wide = stack((128, 1024), convolution(nn.Conv1d), 16, bare_end=False)
+        narrow = stack((4, 64, 64, 64, 128), nn.Conv1d, 8, plain_end=False)
+        wide = stack((128, 1024), nn.Conv1d, 16, plain_end=False)
         self.prepool = nn.Sequential(*narrow, *wide)
-        self.postpool = stack((1024, 512, 256, 2), nn.Linear, 16, bare_end=True)
+        self.postpool = stack((1024, 512, 256, 2), nn.Linear, 16, plain_end=True)
 
-    def forward(
-        self, source: torch.Tensor, target: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, source: Tensor, target: Tensor) -> Tensor:
         """From coordinates [B, N, 3] and [B, M, 3]."""
         both = [
             functional.pad(xyz, (0, 1), value=flag) for flag, xyz in enumerate((source, target))
         ]
         x = self.prepool(torch.cat(both, dim=1).transpose(1, 2)).max(dim=2)[0]
-        beta, alpha = functional.softplus(self.postpool(x)).unbind(1)
-        return beta, alpha
+        return functional.softplus(self.postpool(x))
 
 
-def log_sinkhorn(affinity: torch.Tensor, iterations: int) -> torch.Tensor:
+def log_sinkhorn(affinity: Tensor, iterations: int) -> Tensor:
     """Log assignments [B, N, M] with a slack row and column that are never normalised."""
     x = functional.pad(affinity, (0, 1, 0, 1))
     for _ in range(iterations):
@@ -120,10 +109,8 @@ def log_sinkhorn(affinity: torch.Tensor, iterations: int) -> torch.Tensor:
     return x[:, :-1, :-1]
 
 
-def weighted_procrustes(
-    source: torch.Tensor, target: torch.Tensor, weights: torch.Tensor
-) -> torch.Tensor:
-    """Motions [B, 3, 4] of source [B, N, 3] onto target [B, N, 3] under weights [B, N]."""
+def weighted_procrustes(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
+    """Motions of source [B, N, 3] onto target [B, N, 3] under weights [B, N]."""
     share = (weights / (weights.sum(1, keepdim=True) + _EPSILON))[..., None]
     source_mean = (share * source).sum(1, keepdim=True)
     target_mean = (share * target).sum(1, keepdim=True)
@@ -136,8 +123,8 @@ def weighted_procrustes(
     return torch.cat([rotation, translation], dim=2)
 
 
-def move(motion: torch.Tensor, cloud: torch.Tensor) -> torch.Tensor:
-    """Clouds [B, N, 6] under motions [B, 3, 4]."""
+def move(motion: Tensor, cloud: Tensor) -> Tensor:
+    """Clouds under motions."""
     xyz, normals = cloud.split(3, dim=-1)
     turn = motion[:, :, :3].transpose(1, 2)
     return torch.cat([xyz @ turn + motion[:, None, :, 3], normals @ turn], dim=-1)
@@ -155,16 +142,15 @@ class TorchRpmNet(nn.Module):
         self.feat_extractor = FeatureNet(radius, num_neighbors)
 
     def forward(
-        self, source: torch.Tensor, target: torch.Tensor, iterations: int
-    ) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-        """Motions [B, 3, 4] and assignments [B, N, M] after each iteration, from the identity."""
-        motions, assignments = [], []
-        moved = source
+        self, source: Tensor, target: Tensor, iterations: int
+    ) -> tuple[list[Tensor], list[Tensor]]:
+        """Motions and assignments [B, N, M] after each iteration, from the identity."""
+        motions, assignments, moved = [], [], source
         for _ in range(iterations):
-            beta, alpha = self.weights_net(moved[..., :3], target[..., :3])
+            parameters = self.weights_net(moved[..., :3], target[..., :3])
+            beta, alpha = parameters[..., None, None].unbind(1)
             features = self.feat_extractor(moved), self.feat_extractor(target)
-            excess = square_distance(*features) - alpha[:, None, None]
-            affinity = -beta[:, None, None] * excess
+            affinity = -beta * (square_distance(*features) - alpha)
             assignment = log_sinkhorn(affinity, self.sinkhorn_iterations).exp()
             weights = assignment.sum(2)
             partners = assignment @ target[..., :3] / (weights[..., None] + _EPSILON)
@@ -175,32 +161,25 @@ class TorchRpmNet(nn.Module):
 
 
 def loss(
-    model: TorchRpmNet,
-    source: torch.Tensor,
-    target: torch.Tensor,
-    truth: torch.Tensor,
-    iterations: int,
-) -> torch.Tensor:
+    model: TorchRpmNet, source: Tensor, target: Tensor, truth: Tensor, iterations: int
+) -> Tensor:
     """The published loss: distance of the moved source, 0.01 of the slack, halved backwards."""
-    wanted = move(truth, source)[..., :3]
+    expected = move(truth, source)[..., :3]
     total = torch.zeros(())
-    for place, (motion, assignment) in enumerate(
-        zip(*model(source, target, iterations), strict=True)
-    ):
-        value = functional.l1_loss(move(motion, source)[..., :3], wanted)
-        for axis in (1, 2):
-            value = value + 0.01 * (1 - assignment.sum(axis)).mean()
-        total = total + 0.5 ** (iterations - 1 - place) * value
+    for motion, assignment in zip(*model(source, target, iterations), strict=True):
+        value = functional.l1_loss(move(motion, source)[..., :3], expected)
+        value = value + sum(0.01 * (1 - assignment.sum(axis)).mean() for axis in (1, 2))
+        total = 0.5 * total + value
     return total
 
 
 def make_train_step(
     model: TorchRpmNet, *, iterations: int, learning_rate: float = 1e-4
-) -> Callable[[torch.Tensor, torch.Tensor, torch.Tensor], float]:
-    """A step of Adam on source [B, N, 6], target [B, M, 6] and truth [B, 3, 4]; gives the loss."""
+) -> Callable[[Tensor, Tensor, Tensor], float]:
+    """A step of Adam on source, target and true motion; gives the loss."""
     optimizer = torch.optim.Adam(model.parameters(), lr=learning_rate)
 
-    def step(source: torch.Tensor, target: torch.Tensor, truth: torch.Tensor) -> float:
+    def step(source: Tensor, target: Tensor, truth: Tensor) -> float:
         optimizer.zero_grad()
         value = loss(model, source, target, truth, iterations)
         value.backward()

@@ -16,7 +16,6 @@ from vanejax.training.dataset import ScanSet, make_scan_set
 from vanejax.training.pairs import Pair, PairSampling, ScanBank, draw_pairs, make_bank
 from vanejax.training.train_step import TrainState, init_state, make_optimizer, make_train_step
 
-SOURCES, TARGETS, NEIGHBORS = 717, 1024, 32
 ELEVATIONS_DEG, AZIMUTHS_DEG = (70.0,), (10.0, 100.0, 190.0, 280.0)
 
 
@@ -32,19 +31,12 @@ def vane_scans() -> ScanSet:
 
 @dataclasses.dataclass(frozen=True)
 class VanePairs:
-    """RPM-Net of the default recipe on pairs of fixed size.
+    """RPM-Net of the default recipe on pairs of fixed size."""
 
-    Attributes:
-      sources: N, all rows real.
-      targets: M.
-      neighbors: K.
-      batch: B.
-    """
-
-    sources: int = SOURCES
-    targets: int = TARGETS
-    neighbors: int = NEIGHBORS
-    batch: int = 4
+    sources: int = 717  # N, all rows real
+    targets: int = 1024  # M
+    neighbors: int = 32  # K
+    batch: int = 4  # B
 
     @functools.cached_property
     def config(self) -> Experiment:

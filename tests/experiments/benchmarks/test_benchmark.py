@@ -18,13 +18,14 @@ from experiments.benchmarks import (
     compilation,
     evaluation,
     network,
+    peers,
     processes,
     registration,
+    scaling,
     scanning,
 )
-from experiments.benchmarks import scaling as growing
 from experiments.benchmarks.registration import CountedRays, bare_rays, register_from
-from experiments.benchmarks.scaling_series import Series
+from experiments.benchmarks.scaling import Series
 from experiments.benchmarks.timing import Bench, Figure, summarize, table
 from experiments.benchmarks.vane_pairs import VanePairs
 from experiments.runner import machine
@@ -102,6 +103,13 @@ def test_the_largest_view_is_taken(bench: Bench) -> None:
     assert counts[bench.view] == max(counts.values())
 
 
+@pytest.mark.usefixtures("_no_peers")
+@pytest.mark.parametrize("time", [peers.open3d_icp, peers.small_gicp_icp])
+def test_a_peer_that_is_not_installed_is_skipped(time, bench: Bench) -> None:
+    figure = time(bench)
+    assert (list(figure.seconds), figure.note[:25]) == ([], "skipped: No module named ")
+
+
 # ---- scanning ----
 
 
@@ -119,6 +127,7 @@ def test_the_needed_rays_are_those_of_the_scan(bench: Bench) -> None:
     assert len(origins) < SMALL.camera.width * SMALL.camera.height
 
 
+@pytest.mark.slow
 def test_scans_stand_beside_open3d_and_embree(once: Bench) -> None:
     pytest.importorskip("open3d")
     rows = summarize(list(scanning.scan(once)))
@@ -161,6 +170,7 @@ def test_bare_rays_are_those_of_the_scan(bench: Bench) -> None:
     assert np.mean(face == expected) > 0.99
 
 
+@pytest.mark.slow
 def test_without_weights_half_of_the_registrations_are_skipped(once: Bench) -> None:
     figures = list(register_from(once))
     assert [bool(figure.seconds) for figure in figures] == [True, False, False, True, True]
@@ -177,6 +187,7 @@ def _small_network(monkeypatch) -> None:
     monkeypatch.setattr(network, "VanePairs", sizes)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_small_network")
 def test_the_network_stands_beside_pytorch_and_arithmetic(once: Bench) -> None:
     pytest.importorskip("torch")
@@ -188,6 +199,7 @@ def test_the_network_stands_beside_pytorch_and_arithmetic(once: Bench) -> None:
         assert "32 x 64 points, k = 4" in rows[2]["note"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_small_network", "_no_peers")
 def test_peers_that_are_not_there_are_skipped_with_a_word(once: Bench) -> None:
     def unlike_ours(figures: Iterator[Figure]) -> list[Figure]:
@@ -242,6 +254,7 @@ def test_a_process_that_fails_is_no_time() -> None:
         processes.run(["-c", "raise SystemExit('it went wrong')"])
 
 
+@pytest.mark.slow
 def test_a_start_stands_beside_that_of_python(once: Bench) -> None:
     rows = summarize(list(processes.start(once)))
     assert [row["goal_s"] for row in rows] == [None, 0.5, 1.0]
@@ -256,7 +269,7 @@ def test_compilations_are_told_apart(bench: Bench, monkeypatch) -> None:
         warm = caches.count(caches[-1]) > 1
         return json.dumps({"trace": 1.0, "compile": 0.25 if warm else 6.0})
 
-    monkeypatch.setattr(compilation, "output", answer)
+    monkeypatch.setattr(processes, "output", answer)
     figures = list(compilation.compilation(bench))
     assert [figure.seconds for figure in figures] == [[1.0] * 4, [7.0, 7.0], [0.25, 0.25]]
     assert len(caches) == 4
@@ -267,7 +280,7 @@ def test_an_evaluation_is_told_with_and_without_pictures(bench: Bench, monkeypat
         assert Path(arguments[2]).is_file()
         return json.dumps({"figures": 2.0, "alone": 1.5, "pictures": 3.0})
 
-    monkeypatch.setattr(evaluation, "output", answer)
+    monkeypatch.setattr(processes, "output", answer)
     figures = list(evaluation.evaluation(bench))
     assert figures[1].name == "evaluation, 54 views, first process"
     assert [figure.seconds[0] for figure in figures[1:]] == [2.0, 5.0, 2.0, 5.0]
@@ -278,27 +291,28 @@ def test_an_evaluation_is_told_with_and_without_pictures(bench: Bench, monkeypat
 
 
 def test_a_refined_part_is_the_same_surface() -> None:
-    part = growing.refined(SMALL.part, 2)
+    part = scaling.refined(SMALL.part, 2)
     assert len(part.mesh.faces) == 4 * len(SMALL.part.mesh.faces)
     assert part.mesh.area == pytest.approx(SMALL.part.mesh.area, rel=1e-9)
     assert part.mesh.is_watertight
-    assert growing.refined(SMALL.part, 1) is SMALL.part
+    assert scaling.refined(SMALL.part, 1) is SMALL.part
 
 
 def test_measured_points_are_as_many_as_wanted(bench: Bench) -> None:
     have = len(bench.points)
     for count in (have // 10, 3 * have):
-        points = growing.measured_points(bench, count)
+        points = scaling.measured_points(bench, count)
         assert points.shape == (count, 3)
         assert len(np.unique(points, axis=0)) == count
 
 
+@pytest.mark.slow
 def test_every_cost_has_its_series(once: Bench, monkeypatch) -> None:
     asked = []
     for name in ("registering", "training"):  # which compile; they are timed above
-        monkeypatch.setattr(growing, name, lambda pairs: lambda: asked.append(pairs))
-    sizes = growing.Sizes((1, 2), (0.5, 1.0), (300, 600), (32, 64), (2, 4), (1, 2))
-    series = list(growing.scaling(once, sizes))
+        monkeypatch.setattr(scaling, name, lambda pairs: lambda: asked.append(pairs))
+    sizes = scaling.Sizes((1, 2), (0.5, 1.0), (300, 600), (32, 64), (2, 4), (1, 2))
+    series = list(scaling.scaling(once, sizes))
     assert all(isinstance(one, Series) and len(one.sizes) == 2 for one in series)
     assert [one.unit for one in series] == (
         ["faces"] * 4 + ["pixels"] + ["points"] * 4 + ["neighbours", "pairs"]
@@ -311,6 +325,7 @@ def test_every_cost_has_its_series(once: Bench, monkeypatch) -> None:
 # ---- the command ----
 
 
+@pytest.mark.slow
 def test_the_refinements_are_compared(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(benchmark, "Bench", functools.partial(Bench, views=SMALL))
     arguments = ["--only", "refine", "--repeats", "1", "--out", str(tmp_path)]

@@ -73,6 +73,7 @@ def test_it_finds_what_vanejax_finds(peer: TorchRpmNet, variables: dict, clouds)
     assert np.ptp(assignments[0].numpy()) > 0.1  # or all assignments look alike
 
 
+@pytest.mark.slow
 def test_its_loss_and_gradient_are_those_of_vanejax(
     peer: TorchRpmNet, variables: dict, clouds
 ) -> None:
@@ -93,6 +94,7 @@ def test_its_loss_and_gradient_are_those_of_vanejax(
     np.testing.assert_allclose(theirs, ours, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_a_step_makes_the_loss_smaller(clouds) -> None:
     torch.manual_seed(1)
     model = TorchRpmNet(num_neighbors=K, radius=0.5)

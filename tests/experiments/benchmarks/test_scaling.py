@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments.benchmarks.scaling_series import Series, exponent, scaling_table, summarize_scaling
+from experiments.benchmarks.scaling import Series, exponent, scaling_table, summarize_scaling
 
 SIZES = np.array([10.0, 100.0, 1e3, 1e4, 1e5])
 

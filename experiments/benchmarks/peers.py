@@ -1,4 +1,4 @@
-"""Point-to-plane ICP of other libraries, timed where they are installed."""
+"""Peers of the fine registration: point-to-plane ICP of other libraries."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 
-from experiments.benchmarks.timing import Bench, Figure
+from experiments.benchmarks.timing import Bench, peer
 from vanejax.rigid import RigidTransform
 
 SAMPLES = 100_000  # of the CAD surface
@@ -14,12 +14,10 @@ REACH_MM, MOST_ITERATIONS = 10.0, 50
 OPEN3D_ICP, SMALL_GICP = "Open3D ICP, point to plane", "small_gicp, point to plane"
 
 
-def open3d_icp(bench: Bench) -> Figure:
+@peer(OPEN3D_ICP)
+def open3d_icp(bench: Bench) -> tuple[list[float], str]:
     """Point-to-plane ICP to samples of the CAD surface; the samples' tree is not timed."""
-    try:
-        import open3d
-    except ImportError as error:
-        return Figure(OPEN3D_ICP, [], note=f"skipped: {error}")
+    import open3d
 
     surface, normals, _ = bench.views.part.sample(SAMPLES, seed=0)
     target, source = open3d.geometry.PointCloud(), open3d.geometry.PointCloud()
@@ -37,16 +35,13 @@ def open3d_icp(bench: Bench) -> Figure:
             method.ICPConvergenceCriteria(1e-9, 1e-9, MOST_ITERATIONS),
         )
     )
-    pose = RigidTransform.from_matrix(np.asarray(found.transformation))
-    return Figure(OPEN3D_ICP, seconds, note=bench.error(pose))
+    return seconds, bench.error(RigidTransform.from_matrix(np.asarray(found.transformation)))
 
 
-def small_gicp_icp(bench: Bench) -> Figure:
+@peer(SMALL_GICP)
+def small_gicp_icp(bench: Bench) -> tuple[list[float], str]:
     """The same with small_gicp, on all cores; its normals come from the samples around."""
-    try:
-        import small_gicp
-    except ImportError as error:
-        return Figure(SMALL_GICP, [], note=f"skipped: {error}")
+    import small_gicp
 
     surface, _, _ = bench.views.part.sample(SAMPLES, seed=0)
     target = small_gicp.PointCloud(surface)
@@ -67,5 +62,4 @@ def small_gicp_icp(bench: Bench) -> Figure:
             translation_epsilon=1e-5,
         )
     )
-    pose = RigidTransform.from_matrix(np.asarray(found.T_target_source))
-    return Figure(SMALL_GICP, seconds, note=bench.error(pose))
+    return seconds, bench.error(RigidTransform.from_matrix(np.asarray(found.T_target_source)))
