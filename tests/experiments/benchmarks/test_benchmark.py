@@ -215,6 +215,7 @@ def test_peers_that_are_not_there_are_skipped_with_a_word(once: Bench) -> None:
         assert all("skipped: No module named" in figure.note for figure in skipped)
 
 
+@pytest.mark.slow
 def test_every_source_point_of_a_timed_pair_is_real() -> None:
     pair = VanePairs(sources=32, targets=64).pair(1)
     assert pair.source.mask.shape == (32,)

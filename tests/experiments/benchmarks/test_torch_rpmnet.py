@@ -118,6 +118,7 @@ def test_the_flops_are_those_that_pytorch_counts(peer: TorchRpmNet, clouds) -> N
     assert 2 * each <= total <= 2 * each + 1.1 * small
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not (PARITY / "rpmnet_io.npz").exists(), reason="needs ../shared/parity/rpmnet_*.npz"
 )
