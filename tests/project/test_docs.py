@@ -345,6 +345,16 @@ def test_the_modules_that_pages_name_are_there() -> None:
     assert missing == []
 
 
+def test_the_imports_of_every_page_are_there() -> None:
+    for page in PAGES:
+        for _, code in blocks(page.read_text(), "python"):
+            for node in ast.walk(ast.parse(code)):
+                if isinstance(node, ast.ImportFrom) and node.module.startswith("vanejax"):
+                    module = importlib.import_module(node.module)
+                    missing = [a.name for a in node.names if not hasattr(module, a.name)]
+                    assert missing == [], f"{page.name}: {node.module}"
+
+
 # ---- what is run as it is written
 
 
