@@ -21,9 +21,7 @@ from example_scans import (
 )
 from scipy.stats import chi2
 
-from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cad.part import Part
-from vanejax.errors import InputError
 from vanejax.localization.covariance import uncertainty
 from vanejax.localization.fine_registration import refine, robust_gauss_newton, subset
 from vanejax.localization.residuals import RayCasting, SurfaceMatching
@@ -77,20 +75,9 @@ def fine() -> tuple[np.ndarray, RigidTransform]:
 # --- where it ends ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_from_5_deg_and_5_mm_it_ends_at_the_bound(exact, seed):
-    points, truth = exact
-    points = with_noise(points, 0.1, seed)
-    found = refine(model(vane()), points, disturbed(vane(), truth, 5, 5, seed))
-    bound = true_information(vane(), points, truth, 0.1)
-    assert squared_error(vane(), found.part_from_camera, truth, bound) < CERTAIN
-    assert found.method == "ray casting"
-    assert found.num_points == len(points)
-    assert 0.99 * len(points) <= found.num_inliers <= len(points)
-    assert 3 <= found.iterations < 60
-
-
-@pytest.mark.parametrize("noise_mm", [0.05, 0.1, 0.5, 1.0])
+@pytest.mark.parametrize(
+    "noise_mm", [0.1, *(pytest.param(mm, marks=pytest.mark.slow) for mm in (0.05, 0.5, 1.0))]
+)
 def test_the_error_is_the_bounds_and_no_draw_is_far_off(exact, noise_mm):
     """Twenty draws of noise; seed 18 at 0.1 mm once kept a ray that had slipped off its face."""
     points, truth = exact
@@ -100,7 +87,11 @@ def test_the_error_is_the_bounds_and_no_draw_is_far_off(exact, noise_mm):
         noisy = with_noise(points, noise_mm, seed)
         found = refine(model(vane()), noisy, disturbed(vane(), truth, 5, 5, seed))
         errors.append(squared_error(vane(), found.part_from_camera, truth, bound))
+        assert found.num_points == len(points)
+        assert 0.99 * len(points) <= found.num_inliers <= len(points)
+        assert 3 <= found.iterations < 60
     assert max(errors) < CERTAIN
+    assert found.method == "ray casting"
     # the mean over 20 draws of six: chi-square with 120 degrees of freedom, one in 1,000
     assert np.mean(errors) < 1.2 * chi2.ppf(0.999, 120) / 20
 
@@ -157,8 +148,8 @@ def test_the_same_call_gives_the_same_bits(exact):
 # --- scans that are worse than white noise ------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_ten_percent_of_gross_outliers(exact, seed):
+def test_ten_percent_of_gross_outliers(exact):
+    seed = 1
     points, truth = exact
     points = with_noise(points, 0.1, seed)
     rng = np.random.default_rng(seed)
@@ -171,12 +162,11 @@ def test_ten_percent_of_gross_outliers(exact, seed):
     assert found.noise_mm == pytest.approx(0.1, rel=0.2)
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-def test_a_missing_third(exact, axis):
+def test_a_missing_third(exact):
     points, truth = exact
     points = with_noise(points, 0.1, 1)
-    kept = points[points[:, axis] > np.quantile(points[:, axis], 1 / 3)]
-    found = refine(model(vane()), kept, disturbed(vane(), truth, 5, 5, seed=axis))
+    kept = points[points[:, 0] > np.quantile(points[:, 0], 1 / 3)]
+    found = refine(model(vane()), kept, disturbed(vane(), truth, 5, 5, seed=0))
     bound = true_information(vane(), kept, truth, 0.1)
     assert squared_error(vane(), found.part_from_camera, truth, bound) < CERTAIN
 
@@ -205,8 +195,8 @@ def test_clutter_beside_the_part(exact):
     assert squared_error(vane(), found.part_from_camera, truth, bound) < 2 * CERTAIN
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_without_a_sensor_it_falls_back_to_point_to_plane(fine, seed):
+def test_without_a_sensor_it_falls_back_to_point_to_plane(fine):
+    seed = 0
     points, truth = fine
     points = with_noise(points, 0.1, seed)
     measured = SurfaceMatching(model(vane()).surface, reach_mm=20.0)
@@ -242,7 +232,7 @@ def test_a_plane_leaves_three_directions_open():
     assert abs(sure.weakest_translation_axis[2]) < 0.1
 
 
-@pytest.mark.parametrize("turn_deg", [60, 90, 180])
+@pytest.mark.parametrize("turn_deg", [60, 180])
 def test_from_far_away_the_residuals_tell(exact, turn_deg):
     points, truth = exact
     points = with_noise(points, 0.1, 0)
@@ -258,7 +248,7 @@ def test_from_far_away_the_residuals_tell(exact, turn_deg):
 # --- robust Gauss-Newton --------------------------------------------------------------------------
 
 
-def test_descend_takes_each_pose_of_a_batch_home(exact):
+def test_each_pose_of_a_batch_converges(exact):
     points, truth = exact
     starts = [disturbed(vane(), truth, 10, 5, seed) for seed in range(4)]
     found, iterations = robust_gauss_newton(model(vane()), batch(*starts), points, iterations=20)
@@ -270,7 +260,7 @@ def test_descend_takes_each_pose_of_a_batch_home(exact):
     np.testing.assert_allclose(found.rotation[2], alone.rotation[0], atol=1e-9)
 
 
-def test_descend_stops_where_nothing_moves(exact):
+def test_it_stops_where_nothing_moves(exact):
     points, truth = exact
     _, iterations = robust_gauss_newton(
         model(vane()), batch(truth), points, iterations=20, min_step_deg=0.1
@@ -281,7 +271,7 @@ def test_descend_stops_where_nothing_moves(exact):
 # --- what it says of itself ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("noise_mm", [0.05, 0.1, 0.5, 1.0])
+@pytest.mark.parametrize("noise_mm", [0.05, 1.0])
 def test_the_noise_is_reported(fine, noise_mm):
     points, truth = fine
     noisy = with_noise(points, noise_mm, 0)
@@ -300,6 +290,7 @@ def test_the_information_is_the_bounds(fine):
     assert ratio.max() < 1.1
 
 
+@pytest.mark.slow
 def test_the_covariance_covers_the_errors(exact):
     """Normalised squared errors of 30 draws: their sum is chi-square with 180 degrees."""
     points, truth = exact
@@ -338,31 +329,7 @@ def test_errors_that_go_together_widen_the_covariance(fine):
 # --- stock on the casting ------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def cast() -> tuple[np.ndarray, RigidTransform]:
-    """14,000 points on the vane with 0.5 mm of stock, 0.05 mm of noise; the CAD model's pose."""
-    stock = InvestmentCasting(allowance_mm=0.5, waviness_mm=0)
-    part = as_cast(vane(), stock, np.random.default_rng(0))
-    scan, truth = ideal_scan(part, camera=MIDDLE)
-    return with_noise(exact_points(part, scan), 0.05, 0), truth
-
-
-def test_stock_is_told_from_a_motion(cast):
-    points, truth = cast
-    init = disturbed(vane(), truth, 2, 2, seed=0)
-    plain = refine(model(vane()), points, init)
-    found = refine(model(vane()), points, init, max_allowance_mm=1.0)
-    assert pose_error(vane(), plain.part_from_camera, truth)[1] > 0.4  # what least squares does
-    angle, shift = pose_error(vane(), found.part_from_camera, truth)
-    # the bound of this noise and some, 0.001 deg and 0.001 mm, and what edges add
-    assert angle < 0.01
-    assert shift < 0.02
-    assert found.allowance_mm == pytest.approx(0.5, abs=0.01)
-    assert 0 < found.allowance_sigma_mm < 0.005
-    assert (plain.allowance_mm, plain.allowance_sigma_mm) == (0, 0)
-    assert found.converged
-
-
+@pytest.mark.slow
 def test_an_offset_that_is_not_there_costs_the_pose_little(fine):
     points, truth = fine
     errors, offsets = [], []
@@ -398,13 +365,6 @@ def test_where_a_plane_is_all_that_is_seen_the_offset_stays_what_it_was():
     assert np.isfinite(found.information).all()
     # all that is known of the offset is the prior
     assert found.allowance_sigma_mm == pytest.approx(0.5, rel=0.01)
-
-
-@pytest.mark.parametrize("wrong", [-0.1, np.inf, np.nan])
-def test_an_allowance_that_is_no_length(exact, wrong):
-    points, truth = exact
-    with pytest.raises(InputError, match="max_allowance_mm must be 0 mm or more"):
-        refine(model(vane()), points, truth, max_allowance_mm=wrong)
 
 
 # --- subsets ------------------------------------------------------------------------------------

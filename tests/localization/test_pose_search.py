@@ -52,12 +52,12 @@ def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 # --- rotations ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("count", "cover_deg"), [(400, 34.0), (1200, 24.0)])
-def test_uniform_rotations_cover_all_rotations(count, cover_deg):
-    """``count`` balls of angle t hold all of SO(3) where count (t - sin t) = pi: 20.7, 14.3 deg.
+def test_uniform_rotations_cover_all_rotations():
+    """400 balls of angle t hold all of SO(3) where 400 (t - sin t) = pi: 20.7 deg.
 
     Balls that cover it overlap, so they are larger: half as large again is a good cover.
     """
+    count, cover_deg = 400, 34.0
     spread = uniform_rotations(count)
     assert spread.shape == (count, 3, 3)
     gram = spread @ spread.swapaxes(1, 2)
@@ -191,9 +191,8 @@ def test_challenge_keeps_the_best_where_nothing_is_alike():
 # --- search -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_vane_is_found_from_nothing(seed):
-    points, truth = measured_points(vane(), random_view(vane(), seed))
+def test_the_vane_is_found_from_nothing():
+    points, truth = measured_points(vane(), random_view(vane(), 0))
     found = search(model(vane()), points)
     angle, shift = pose_error(vane(), found.pose(0), truth)
     assert angle < 0.1
@@ -204,6 +203,7 @@ def test_the_vane_is_found_from_nothing(seed):
     assert (np.diff(found.score) <= 0).all()
 
 
+@pytest.mark.slow
 def test_a_box_is_found_in_all_its_four_poses():
     points, truth = measured_points(box(), random_view(box(), seed=5), noise_mm=0.05)
     found = search(model(box()), points)
@@ -213,6 +213,7 @@ def test_a_box_is_found_in_all_its_four_poses():
         assert np.min(angle + shift) < 1.0
 
 
+@pytest.mark.slow
 def test_without_a_sensor_the_part_is_found_too():
     points, truth = measured_points(bracket(), random_view(bracket(), seed=1), noise_mm=0.05)
     frame = motion(box(), [50, 60, -70], [100, 200, 300])
@@ -263,14 +264,6 @@ def test_noise_level_is_that_of_the_points_near_the_part():
     # nothing near at all: the largest that is near
     lost = noise_level(model(vane()), batch(truth), clutter + np.array([0, 0, -1000.0]))
     assert lost[0] == pytest.approx(1.4826 * 0.1 * vane().radius)
-
-
-def test_every_pose_of_a_search_is_rigid():
-    points, _ = measured_points(vane())
-    found = search(model(vane()), points, count=50)
-    for rotation in found.part_from_camera.rotation:
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
-        assert np.linalg.det(rotation) > 0
 
 
 def test_a_challenge_keeps_the_best_even_where_nothing_fits(monkeypatch):

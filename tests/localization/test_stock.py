@@ -47,8 +47,8 @@ def test_stock_moves_the_part_unless_it_is_estimated() -> None:
     refinement = found(1.0).refinement
     assert refinement.allowance_mm == pytest.approx(STOCK_MM, abs=0.03)
     assert 0 < refinement.allowance_sigma_mm < 0.03
-    said = [any("stock is taken to be the same" in n for n in found(m).notes) for m in (0.0, 1.0)]
-    assert said == [False, True]
+    for most_mm, noted in ((0.0, False), (1.0, True)):
+        assert any("stock is taken to be the same" in n for n in found(most_mm).notes) is noted
 
 
 def test_the_checks_are_of_the_part_under_its_stock() -> None:
