@@ -97,15 +97,6 @@ def test_distances_are_those_of_the_motion_between(turn):
         assert moved[0] == pytest.approx(np.linalg.norm(shift), abs=1e-9)
 
 
-def test_distances_do_not_depend_on_the_camera_frame():
-    part = box()
-    a, b = (random_view(part, seed).inverse() for seed in (1, 2))
-    frame = motion(box(), [50, 60, -70], [100, 200, 300])
-    here = distances(batch(a), b, part)
-    there = distances(batch(a @ frame), b @ frame, part)
-    np.testing.assert_allclose(here, there, atol=1e-9)
-
-
 def test_distinct_keeps_the_first_of_those_that_are_near():
     part = box()
     near_deg, near_mm = 0.9 * SAME_DEG, 0.9 * SAME_SHIFT * part.radius

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,6 +21,7 @@ from tqdm import tqdm
 
 from experiments.runner import study_command as study
 from experiments.runner.vane_views import VaneViews, magnitudes, pose_error, with_noise
+from experiments.studies.verdicts.report import verdict_counts
 from vanejax.localization.registration import register
 from vanejax.rigid import RigidTransform
 from vanejax.scans.measured_scan import MeasuredScan
@@ -72,17 +72,12 @@ def attempt(
 
 def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Shares, counts and times of all attempts; wrong poses are listed one by one."""
-    verdicts = Counter((row["verdict"], row["right"]) for row in rows)
     stages = dict.fromkeys(stage for row in rows for stage in row["stages"])
     right = [row for row in rows if row["right"]]
     return {
         "attempts": len(rows),
         "right": len(right) / len(rows),
-        "accepted_wrong": verdicts["accepted", False],
-        "verdicts": {
-            status: {"right": verdicts[status, True], "wrong": verdicts[status, False]}
-            for status in ("accepted", "ambiguous", "rejected")
-        },
+        **verdict_counts(rows),
         "median_of_right": {
             name: float(np.median([row[name] for row in right])) if right else None
             for name in ("rotation_deg", "translation_mm")

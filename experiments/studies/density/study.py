@@ -84,8 +84,8 @@ def fit(scan: np.ndarray, tree: cKDTree, normals: np.ndarray) -> dict[str, float
     The neighbours are `vanejax.matching.metrics.nearest_offsets`, found by a tree for large clouds.
     """
     nearest = tree.query(scan, workers=-1)[1]
-    found = _metrics((tree.data[nearest] - scan).astype(np.float32), normals[nearest])
-    return {name: float(value) for name, value in found.items()}
+    metrics = _metrics((tree.data[nearest] - scan).astype(np.float32), normals[nearest])
+    return {name: float(value) for name, value in metrics.items()}
 
 
 @jax.jit
@@ -163,7 +163,7 @@ def slope(sizes: Sequence[int], means: np.ndarray) -> float:
     return float(np.polyfit(np.log(sizes), np.log(np.maximum(means, 1e-9)), 1)[0])
 
 
-def told(score: np.ndarray) -> np.ndarray:
+def share_distinguished(score: np.ndarray) -> np.ndarray:
     """[S, E] share of the draws that score above the true pose's mean by `TOLD_STD` or more.
 
     In standard deviations of the true pose's draws at the same size, of scores [S, E, D]. Not in
@@ -227,7 +227,7 @@ def summarize(sweep: Sweep, area_mm2: float) -> dict[str, Any]:
     errors, sizes = range(len(sweep.errors)), sweep.sizes
     for name in METRICS:
         score = sweep.score(name)
-        mean, share = score.mean(axis=2), told(score)
+        mean, share = score.mean(axis=2), share_distinguished(score)
         settled = np.abs(mean - mean[-1:]) <= SETTLED * mean[-1:]
         settled[-1] = np.abs(mean[-1] - mean[-2]) <= SETTLED * mean[-1]  # or it always would be
         report[name] = {
@@ -263,11 +263,11 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
         ("scan", SCAN_POINTS, 0.0, 0.0),
         ("scan", SCAN_POINTS, NOISE, NOISE),
     ):
-        found = measure(
+        sweep = measure(
             views, which, varied=varied, sizes=sizes, cad_noise=cad_noise, scan_noise=scan_noise,
             draws=settings.draws, seed=settings.seed,
         )  # fmt: skip
-        sweeps.append(summarize(found, area))
+        sweeps.append(summarize(sweep, area))
         print(table(sweeps[-1]), end="\n\n")
     words = verdict(sweeps)
     print(f"{LEGEND}\n\n{textwrap.fill(words, 100)}")

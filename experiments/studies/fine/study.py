@@ -27,6 +27,7 @@ from experiments.runner import study_command as study
 from experiments.runner.vane_views import VaneViews, magnitudes, perturb, pose_error, with_noise
 from vanejax.localization.covariance import uncertainty
 from vanejax.localization.fine_registration import refine
+from vanejax.localization.pose_batch import stack
 from vanejax.localization.residuals import RayCasting
 from vanejax.plotting.canvas import (
     FAINT,
@@ -95,8 +96,7 @@ def cramer_rao(
     The inverse of ``J^T J / noise^2`` with the derivatives J of the ranges of all rays that hit, at
     the true pose; points [N, 3] are free of noise.
     """
-    batch = RigidTransform(truth.rotation[None], truth.translation[None])
-    ideal = model.residuals(batch, points)
+    ideal = model.residuals(stack(truth), points)
     rows = ideal.jacobian[0][ideal.hit[0]] / ideal.cosine[0][ideal.hit[0], None]
     return np.linalg.inv(rows.T @ rows) * noise_mm**2
 
@@ -117,17 +117,17 @@ def refine_view(
     start = perturb(truth, part, deg=start_deg, mm=start_mm, rng=rng)
     points = with_noise(ideal, noise_mm, rng)
     began = time.perf_counter()
-    found = refine(views.model, points, start)
+    refinement = refine(views.model, points, start)
     seconds = time.perf_counter() - began
     return Fit(
         view=view,
-        error=pose_error(found.part_from_camera, truth, part.center),
+        error=pose_error(refinement.part_from_camera, truth, part.center),
         bound=cramer_rao(views.model, ideal, truth, noise_mm),
-        covariance=uncertainty(found, part.center).covariance,
-        noise_mm=found.noise_mm,
-        converged=found.converged,
-        iterations=found.iterations,
-        num_points=found.num_points,
+        covariance=uncertainty(refinement, part.center).covariance,
+        noise_mm=refinement.noise_mm,
+        converged=refinement.converged,
+        iterations=refinement.iterations,
+        num_points=refinement.num_points,
         seconds=seconds,
     )
 
@@ -184,18 +184,13 @@ def measure(views: VaneViews, settings: argparse.Namespace) -> list[dict[str, An
     fits: dict[float, list[Fit]] = {noise: [] for noise in settings.noise_mm}
     for view in tqdm(views.select(settings.views), "refining", unit="view"):
         ideal = views.points(view)
-        for noise, found in fits.items():
+        for noise, of_noise in fits.items():
             fit = refine_view(
-                views,
-                view,
-                ideal,
-                noise_mm=noise,
-                start_deg=settings.start_deg,
-                start_mm=settings.start_mm,
-                seed=settings.seed,
-            )
-            found.append(fit)
-    return [summarize(found, noise) for noise, found in fits.items()]
+                views, view, ideal, noise_mm=noise, start_deg=settings.start_deg,
+                start_mm=settings.start_mm, seed=settings.seed,
+            )  # fmt: skip
+            of_noise.append(fit)
+    return [summarize(of_noise, noise) for noise, of_noise in fits.items()]
 
 
 def basin(
@@ -208,19 +203,19 @@ def basin(
         ideal = views.points(view)
         for number, (deg, mm) in enumerate(sizes):
             fit = refine_view(
-                views,
-                view,
-                ideal,
-                noise_mm=BASIN_NOISE_MM,
-                start_deg=deg,
-                start_mm=mm,
+                views, view, ideal, noise_mm=BASIN_NOISE_MM, start_deg=deg, start_mm=mm,
                 seed=seed + number,
-            )
+            )  # fmt: skip
             turn, shift = magnitudes(fit.error)
             arrived[deg, mm].append(turn < ARRIVED_DEG and shift < ARRIVED_MM)
     return [
-        {"start_deg": deg, "start_mm": mm, "views": len(found), "arrived": float(np.mean(found))}
-        for (deg, mm), found in arrived.items()
+        {
+            "start_deg": deg,
+            "start_mm": mm,
+            "views": len(of_size),
+            "arrived": float(np.mean(of_size)),
+        }
+        for (deg, mm), of_size in arrived.items()
     ]
 
 

@@ -38,7 +38,7 @@ NEAR_DEG, NEAR_MM = 3.0, 3.0  # not much more than the truth itself may be off
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Known:
+class KnownScan:
     """One scan whose pose is known.
 
     Attributes:
@@ -53,12 +53,12 @@ class Known:
     cad_units: str
     camera_from_part: np.ndarray
 
-    def error(self, found: RigidTransform) -> tuple[float, float]:
+    def error(self, part_from_camera: RigidTransform) -> tuple[float, float]:
         """Degrees and mm of a part_from_camera to the nearest right answer.
 
         That for which angle and distance, as shares of what is still right, are smallest together.
         """
-        pose = found.inverse().as_matrix()
+        pose = part_from_camera.inverse().as_matrix()
         turn = pose[:3, :3].T @ self.camera_from_part[:, :3, :3]
         angle = np.degrees(Rotation.from_matrix(turn).magnitude())
         shift = np.linalg.norm(self.camera_from_part[:, :3, 3] - pose[:3, 3], axis=1)
@@ -66,7 +66,7 @@ class Known:
         return float(angle[best]), float(shift[best])
 
 
-def load_truth(folder: Path) -> list[Known]:
+def load_truth(folder: Path) -> list[KnownScan]:
     """The scans of a folder.
 
     Raises:
@@ -79,7 +79,7 @@ def load_truth(folder: Path) -> list[Known]:
     return [_known(entry, folder, f"{path}: entry {n}") for n, entry in enumerate(entries)]
 
 
-def _known(entry: Any, folder: Path, where: str) -> Known:
+def _known(entry: Any, folder: Path, where: str) -> KnownScan:
     try:
         poses = np.asarray(entry["scan_from_cad_mm"], np.float64)
         unit_mm = float(entry["cad_unit_mm"])
@@ -94,22 +94,24 @@ def _known(entry: Any, folder: Path, where: str) -> Known:
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
         raise InputError(f"{where}: scan_from_cad_mm has shape {list(poses.shape)}, not [S, 4, 4]")
     poses = np.stack([rigid_from_matrix(pose, where=where).as_matrix() for pose in poses])
-    return Known(scan, cad, scan_units, units[0], poses)
+    return KnownScan(scan, cad, scan_units, units[0], poses)
 
 
-def measure(scans: Sequence[Known], seed: int, sensor: str | None = None) -> list[dict[str, Any]]:
+def measure(
+    scans: Sequence[KnownScan], seed: int, sensor: str | None = None
+) -> list[dict[str, Any]]:
     """Registers every scan; a row for each."""
     load = functools.cache(lambda cad, units: load_part(cad, units=units))
     return [_row(known, load(known.cad, known.cad_units), seed, sensor) for known in scans]
 
 
-def _row(known: Known, part: Part, seed: int, sensor: str | None) -> dict[str, Any]:
+def _row(known: KnownScan, part: Part, seed: int, sensor: str | None) -> dict[str, Any]:
     began = time.perf_counter()
     result = register(known.scan, part, units_scan=known.scan_units, sensor=sensor, seed=seed)
     seconds = time.perf_counter() - began
     angle, shift = known.error(result.part_from_camera)
     listed = [known.error(other.part_from_camera) for other in result.alternatives]
-    seen = result.verification
+    verification = result.verification
     return {
         "scan": known.scan.name,
         "part": part.name,
@@ -120,10 +122,10 @@ def _row(known: Known, part: Part, seed: int, sensor: str | None) -> dict[str, A
         "verdict": result.verdict.status,
         "reason": result.verdict.reason,
         "alternatives": len(listed),
-        "inlier_share": seen.inlier_share,
-        "violation_share": seen.violation_share,
-        "unmeasured_share": seen.unmeasured_share,
-        "tolerance_mm": seen.tolerance_mm,
+        "inlier_share": verification.inlier_share,
+        "violation_share": verification.violation_share,
+        "unmeasured_share": verification.unmeasured_share,
+        "tolerance_mm": verification.tolerance_mm,
         "seconds": seconds,
     }
 
@@ -195,12 +197,12 @@ def sensor_table(report: dict[str, Any]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     sensor = report["sensor"]
-    for name, found in (("as they are", report), (f"`--sensor {sensor['name']}`", sensor)):
-        mean = found["mean_of_right"]
+    for name, rows in (("as they are", report), (f"`--sensor {sensor['name']}`", sensor)):
+        mean = rows["mean_of_right"]
         lines.append(
-            f"| {name} | {found['right']} | {found['near']} | {found['accepted']} "
-            f"({found['accepted_wrong']}) | {mean['rotation_deg']:.2f} | "
-            f"{mean['translation_mm']:.2f} | {found['seconds']['median']:.2f} |"
+            f"| {name} | {rows['right']} | {rows['near']} | {rows['accepted']} "
+            f"({rows['accepted_wrong']}) | {mean['rotation_deg']:.2f} | "
+            f"{mean['translation_mm']:.2f} | {rows['seconds']['median']:.2f} |"
         )
     return "\n".join(lines)
 

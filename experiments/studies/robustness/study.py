@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,14 +27,15 @@ from experiments.runner.vane_views import magnitudes, perturb, pose_error
 from experiments.studies.density.study import fit
 from experiments.studies.robustness import report as robustness_report
 from experiments.studies.robustness.disturbances import Disturbed, Series, make_series
+from experiments.studies.verdicts.report import verdict_counts
 from vanejax.cad.parametric_vane import guide_vane
 from vanejax.cad.part import Part
-from vanejax.cad.surface import Surface
 from vanejax.errors import InputError
 from vanejax.localization.fine_registration import refine
 from vanejax.localization.matched_poses import match_poses
+from vanejax.localization.pose_batch import select, stack
 from vanejax.localization.registration import register
-from vanejax.localization.residuals import RayCasting
+from vanejax.localization.residuals import measurement_model
 from vanejax.plotting.canvas import save_figure
 from vanejax.pointcloud import voxel_thin
 from vanejax.rigid import RigidTransform
@@ -58,11 +58,11 @@ class Trial:
 
     def __init__(self, part: Part, networks: Mapping[str, TrainedMatcher]) -> None:
         self.part, self.networks = part, networks
-        self._model = RayCasting(Scanner(part), Surface(part), np.zeros(3))
-        any_one = next(iter(networks.values()))
-        self._tree = cKDTree(any_one.reference_points.astype(np.float64))
-        self._normals = any_one.reference_normals
-        self._voxel_mm = any_one.voxel_mm
+        self._model = measurement_model(part, np.zeros(3))
+        matcher = next(iter(networks.values()))
+        self._tree = cKDTree(matcher.reference_points.astype(np.float64))
+        self._normals = matcher.reference_normals
+        self._voxel_mm = matcher.voxel_mm
 
     def row(
         self, scan: Disturbed, rng: np.random.Generator, *, max_allowance_mm: float = 0.0
@@ -73,15 +73,14 @@ class Trial:
         row = {
             "points": len(scan.points),
             "hole_share": scan.measured.hole_share,
-            "foreign_share": scan.foreign_share,
+            "foreign_share": scan.clutter_share,
             "truth": self._fit(scan, truth),
         }
         cloud = MeasuredScan(scan.points, None, np.zeros(3))
         for name, matcher in self.networks.items():
-            guess = RigidTransform(init.rotation[None], init.translation[None])
             began = time.perf_counter()
-            found = match_poses(matcher, cloud, guess, iterations=matcher.iterations)
-            matched = RigidTransform(found.rotation[0], found.translation[0])
+            poses = match_poses(matcher, cloud, stack(init), iterations=matcher.iterations)
+            matched = select(poses, 0)
             middle = time.perf_counter()
             fine = refine(self._model, scan.points, matched, max_allowance_mm=max_allowance_mm)
             end = time.perf_counter()
@@ -100,8 +99,8 @@ class Trial:
     def _fit(self, scan: Disturbed, pose: RigidTransform) -> dict[str, float]:
         """RMSE and FFMDE (eqs 1, 2) of the thinned scan on the thinned surface of the part."""
         thinned = scan.points[voxel_thin(scan.points, voxel_mm=self._voxel_mm)]
-        found = fit(pose.apply(thinned), self._tree, self._normals)
-        return {name: found[name] for name in ("rmse_mm", "ffmde_abs_mm")}
+        metrics = fit(pose.apply(thinned), self._tree, self._normals)
+        return {name: metrics[name] for name in ("rmse_mm", "ffmde_abs_mm")}
 
 
 def _rough(truth: RigidTransform, part: Part, rng: np.random.Generator) -> RigidTransform:
@@ -131,7 +130,7 @@ def run_series(trial: Trial, series: Series, seed: int) -> dict[str, Any]:
         "paper": None
         if series.paper is None
         else {"rmse_mm": series.paper[0], "ffmde_abs_mm": series.paper[1]},
-        "steps": [{"value": value, "rows": found} for value, found in rows.items()],
+        "steps": [{"value": value, "rows": of_value} for value, of_value in rows.items()],
     }
 
 
@@ -172,15 +171,10 @@ def run_random(part: Part, matcher: TrainedMatcher, count: int, seed: int) -> di
 
 def summarize_random(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Shares and verdicts; only what is not right or not accepted is listed one by one."""
-    verdicts = Counter((row["verdict"], row["right"]) for row in rows)
     return {
         "scans": len(rows),
         "right": sum(row["right"] for row in rows) / len(rows),
-        "accepted_wrong": verdicts["accepted", False],
-        "verdicts": {
-            status: {"right": verdicts[status, True], "wrong": verdicts[status, False]}
-            for status in ("accepted", "ambiguous", "rejected")
-        },
+        **verdict_counts(rows),
         **{
             name: {
                 "mean": float(np.mean([row[name] for row in rows])),
@@ -222,7 +216,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     report = study.header("RPM-Net, then ray casting", settings, part) | {
         "networks": {name: dict(matcher.trained) for name, matcher in networks.items()},
         "sensor": SENSOR,
-        "series": [run_series(trial, one, settings.seed) for one in series],
+        "series": [run_series(trial, each, settings.seed) for each in series],
         "random": None,
     }
     if settings.random:

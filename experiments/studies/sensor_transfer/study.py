@@ -31,7 +31,7 @@ from experiments.runner.experiment import (
 )
 from experiments.runner.run_folder import RunFolder
 from experiments.runner.vane_views import perturb
-from experiments.studies.real_scans.study import RIGHT_DEG, RIGHT_MM, Known, load_truth
+from experiments.studies.real_scans.study import RIGHT_DEG, RIGHT_MM, KnownScan, load_truth
 from experiments.train import fit, load_or_scan
 from vanejax.cad.part import Part
 from vanejax.cad.surface import Surface
@@ -56,7 +56,7 @@ NO_NETWORK = "none: the rough pose"
 _STARTS = 0x7247  # folded into the seed
 
 
-def recipe(known: Known, sensor: str, *, effects: bool, steps: int, seed: int) -> Experiment:
+def recipe(known: KnownScan, sensor: str, *, effects: bool, steps: int, seed: int) -> Experiment:
     """The training for one part; only ``online.effects`` tells two of them apart."""
     return Experiment(
         name=f"{known.cad.stem}_{sensor if effects else IDEAL}",
@@ -93,7 +93,9 @@ class Trial:
         self.part, self.networks = part, networks
         self._model = RayCasting(Scanner(part), Surface(part), np.zeros(3))
 
-    def rows(self, known: Known, *, starts: int, rng: np.random.Generator) -> list[dict[str, Any]]:
+    def rows(
+        self, known: KnownScan, *, starts: int, rng: np.random.Generator
+    ) -> list[dict[str, Any]]:
         """What every network finds in one scan, from each start."""
         extent = self.part.extent_mm
         points = load_scan(known.scan, units=known.scan_units, part_extent_mm=extent).points
@@ -120,7 +122,7 @@ class Trial:
             row[NO_NETWORK] = {"alone": _errors(known, init), "refined": _errors(known, fine)}
         return rows
 
-    def _start(self, known: Known, rng: np.random.Generator) -> RigidTransform:
+    def _start(self, known: KnownScan, rng: np.random.Generator) -> RigidTransform:
         """A pose beside one of the right ones."""
         right = known.camera_from_part[rng.integers(len(known.camera_from_part))]
         return perturb(
@@ -132,7 +134,7 @@ class Trial:
         )
 
 
-def _errors(known: Known, found: RigidTransform) -> dict[str, Any]:
+def _errors(known: KnownScan, found: RigidTransform) -> dict[str, Any]:
     rotation_deg, translation_mm = known.error(found)
     return {
         "rotation_deg": rotation_deg,

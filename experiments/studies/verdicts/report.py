@@ -126,6 +126,18 @@ def summarize(
     }
 
 
+def verdict_counts(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Right and wrong poses of each verdict, and how many wrong ones were accepted."""
+    count = Counter((row["verdict"], row["right"]) for row in rows)
+    return {
+        "accepted_wrong": count["accepted", False],
+        "verdicts": {
+            status: {"right": count[status, True], "wrong": count[status, False]}
+            for status in STATUSES
+        },
+    }
+
+
 def _verdicts(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Counts of the verdicts, with competing hypotheses and without."""
     count = Counter(row["verdict"] for row in rows)
@@ -177,12 +189,12 @@ def table(report: Mapping[str, Any]) -> str:
         lines.append(f"  {outcome.replace('_', ' '):<32}{cells}")
     for row in (*report["accepted_wrong"], *report["registered"]):
         if row["verdict"] == "accepted" and not row["right"]:
-            found = row.get("kind", "register")
-            if found == OTHER_PART:
-                found = f"taken for {row['sought']}"
+            error = row.get("kind", "register")
+            if error == OTHER_PART:
+                error = f"taken for {row['sought']}"
             else:
-                found += f", {row['rotation_deg']:.2f} deg, {row['translation_mm']:.2f} mm off"
-            lines.append(f"ACCEPTED AND WRONG: {row['part']}, {row['sensor']}: {found}")
+                error += f", {row['rotation_deg']:.2f} deg, {row['translation_mm']:.2f} mm off"
+            lines.append(f"ACCEPTED AND WRONG: {row['part']}, {row['sensor']}: {error}")
     return "\n".join(lines)
 
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from experiments.runner.vane_views import VaneViews
 from experiments.studies.density import study as density
-from experiments.studies.density.report import table, verdict
+from experiments.studies.density.report import verdict
 from experiments.studies.density.study import (
     ERRORS,
     METRICS,
@@ -24,9 +24,9 @@ from experiments.studies.density.study import (
     main,
     measure,
     ranked_right,
+    share_distinguished,
     slope,
     summarize,
-    told,
 )
 from vanejax.errors import InputError
 from vanejax.matching.metrics import surface_fit
@@ -159,9 +159,9 @@ def test_slope_is_the_exponent() -> None:
     assert np.isfinite(slope(sizes, np.zeros(3)))
 
 
-def test_told_counts_draws_beyond_three_standard_deviations() -> None:
+def test_the_share_counts_draws_beyond_three_standard_deviations() -> None:
     score = np.array([[[1.0, 3.0], [6.2, 6.3], [6.2, 6.3], [0.0, 99.0]]])  # 2 + 3 sqrt 2 = 6.24
-    np.testing.assert_array_equal(told(score), [[0, 0.5, 0.5, 0.5]])
+    np.testing.assert_array_equal(share_distinguished(score), [[0, 0.5, 0.5, 0.5]])
 
 
 def test_the_first_of_the_rest_stays_good() -> None:
@@ -207,14 +207,6 @@ def test_the_verdict_follows_the_numbers() -> None:
         found.values["rmse_mm"] = found.values["ffmde_abs_mm"]
         scan = Sweep("scan", 0.0, 0.0, [1] * 3, [1, 2, 4], ERRORS, found.values)
         assert says in verdict([summarize(good, 1.0), summarize(scan, 1.0)])
-
-
-def test_the_table_shows_the_means(sweep: Sweep) -> None:
-    rows = table(summarize(sweep, 1.0)).splitlines()
-    assert len(rows) == 2 + len(METRICS) * len(ERRORS)
-    assert all(f"{count:,}" in rows[1] for count in COUNTS)
-    for value in sweep.values["rmse_mm"][:, 0].mean(axis=1):
-        assert f"{value:.3f}" in rows[2]
 
 
 def test_the_command_writes_what_it_prints(

@@ -50,7 +50,7 @@ def test_structured_light_is_the_paper_s_camera_with_fewer_pixels(box, scanner, 
     assert abs(np.mean(error)) < 0.05
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_depth_camera_is_like_the_real_one(box, scanner, seed):
     pose = random_pose(np.random.default_rng(seed), box, 250.0)
     points = measure(box, scanner, pose, kind="depth_camera", seed=seed)
@@ -71,8 +71,7 @@ def test_the_depth_camera_errs_more_from_farther(box, scanner):
     for depth in (200.0, 400.0):
         pose = RigidTransform(np.eye(3), np.array([0.0, 0.0, -depth - 20]) - box.center)
         errors = [
-            measure(box, scanner, pose, kind="depth_camera", seed=s)[:, 2] + depth
-            for s in range(12)
+            measure(box, scanner, pose, kind="depth_camera", seed=s)[:, 2] + depth for s in range(6)
         ]
         errors = np.concatenate(errors)
         rms[depth] = np.sqrt(np.mean(errors[np.abs(errors) < 15] ** 2))
@@ -80,7 +79,7 @@ def test_the_depth_camera_errs_more_from_farther(box, scanner):
     assert 1.8 < rms[400.0] / rms[200.0] < 4.5
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_clutter_is_a_tenth_to_a_fifth_and_not_of_the_part(box, scanner, seed):
     pose = random_pose(np.random.default_rng([seed, 5]), box, 300.0)
     points = measure(box, scanner, pose, kind="clutter", seed=seed)
@@ -96,11 +95,6 @@ def test_the_same_seed_gives_the_same_points_and_another_does_not(box, scanner, 
     other = measure(box, scanner, frontal, kind=kind, seed=4)
     np.testing.assert_array_equal(once, again)
     assert other.shape != once.shape or np.any(other != once)
-
-
-def test_an_unknown_kind_is_refused(box, scanner, frontal):
-    with pytest.raises(InputError, match="no sensor kind"):
-        measure(box, scanner, frontal, kind="lidar", seed=0)
 
 
 def test_random_poses_are_uniform_and_at_their_distance(box):

@@ -74,14 +74,14 @@ def test_strong_light_saturates_the_share_asked_for(model, share):
 
 def test_chips_and_drops_are_measured_and_stay(series):
     clean, littered = (series["chips"].take(count, 0) for count in (0.0, 40.0))
-    assert clean.foreign_share == 0
-    assert 0.003 < littered.foreign_share < 0.5
+    assert clean.clutter_share == 0
+    assert 0.003 < littered.clutter_share < 0.5
 
 
 def test_a_table_is_taken_away_again(series, model):
     scan = series["fixture"].take(2.0, 0)
     assert len(scan.points) < 0.7 * len(scan.measured.points)
-    assert scan.foreign_share < 0.3
+    assert scan.clutter_share < 0.3
     assert np.median(np.abs(deviations(model, scan))) < 0.3
 
 
@@ -110,8 +110,8 @@ def test_a_table_that_stays_counts_as_foreign(series, monkeypatch):
     scan = series["fixture"].take(0.0, 0)  # the table is all there is beside the part
     assert len(scan.points) == len(scan.measured.points)
     on_table = np.isclose(deviations_from_table_mm(scan), 0, atol=1.0).mean()
-    assert scan.foreign_share == pytest.approx(on_table, abs=0.03)
-    assert scan.foreign_share > 0.3
+    assert scan.clutter_share == pytest.approx(on_table, abs=0.03)
+    assert scan.clutter_share > 0.3
 
 
 def deviations_from_table_mm(scan: Disturbed) -> np.ndarray:

@@ -185,7 +185,7 @@ def test_draws_repeat_and_differ(views: VaneViews, points: np.ndarray) -> None:
         assert np.linalg.norm(other[3:] - first[3:]) > 0.2 * np.linalg.norm(first[3:])
 
 
-def test_from_five_degrees_all_arrive(views: VaneViews) -> None:
+def test_from_five_degrees_all_arrive() -> None:
     finer = VaneViews(camera=Camera().scaled(0.4))
     rows = basin(finer, [VIEW], 0, degrees=(5.0,))
     assert [(row["start_deg"], row["start_mm"]) for row in rows] == [(5, 5), (5, 10), (5, 20)]

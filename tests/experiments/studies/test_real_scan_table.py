@@ -10,13 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from experiments.studies.real_scans.study import (
-    Known,
+    KnownScan,
     load_truth,
     main,
     make_parser,
     summarize,
     table,
 )
+from experiments.studies.real_scans.study import measure as measure_real_scans
 from experiments.studies.verdicts.challenge_parts import challenge_parts
 from experiments.studies.verdicts.depth_camera import measure, random_pose
 from vanejax.cad.symmetry import rotation_about
@@ -26,6 +27,8 @@ from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.scan_file import save_points
 
 REAL = Path(__file__).parents[4] / "shared" / "data" / "real_scans"
+REAL_SCANS = load_truth(REAL) if REAL.is_dir() else []
+IN_DEFAULT_RUN = ("Range_Hood_1.ply", "Separator_1.ply")
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +69,7 @@ def test_a_folder_becomes_a_table(folder: Path, tmp_path: Path, capsys) -> None:
     assert "sensor" not in report
 
 
+@pytest.mark.slow
 def test_a_named_sensor_is_a_second_column(folder: Path, tmp_path: Path, capsys) -> None:
     arguments = [str(folder), "--out", str(tmp_path), "--sensor", "consumer_depth"]
     report = main(make_parser().parse_args(arguments))
@@ -77,8 +81,8 @@ def test_a_named_sensor_is_a_second_column(folder: Path, tmp_path: Path, capsys)
     assert "without what the window of consumer_depth rounds off" in capsys.readouterr().out
 
 
-def known(poses: np.ndarray) -> Known:
-    return Known(Path("scan"), Path("cad"), "m", "mm", poses)
+def known(poses: np.ndarray) -> KnownScan:
+    return KnownScan(Path("scan"), Path("cad"), "m", "mm", poses)
 
 
 def test_the_error_is_that_to_the_nearest_right_pose() -> None:
@@ -158,9 +162,26 @@ def test_an_accepted_wrong_pose_is_seen() -> None:
     assert table(slow).splitlines()[-1].startswith("MISSED")
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="the real scans are not here")
-def test_the_real_folder_is_understood() -> None:
-    scans = load_truth(REAL)
-    assert len(scans) == 15
-    assert all(one.scan.is_file() and one.cad.is_file() for one in scans)
-    assert {one.cad_units for one in scans} == {"mm", "cm"}
+@pytest.mark.parametrize(
+    "scan",
+    [
+        pytest.param(
+            scan,
+            marks=() if scan.scan.name in IN_DEFAULT_RUN else pytest.mark.slow,
+            id=scan.scan.name,
+        )
+        for scan in REAL_SCANS
+    ],
+)
+def test_a_real_scan_is_within_5_deg_and_5_mm_from_no_guess(scan: KnownScan) -> None:
+    """Scans of a depth camera: right, and never rejected."""
+    (row,) = measure_real_scans([scan], seed=0)
+    assert row["right"]
+    assert row["verdict"] in ("accepted", "ambiguous")
+
+
+@pytest.mark.skipif(not REAL_SCANS, reason=f"the real scans are not at {REAL}")
+def test_all_15_real_scans_are_there() -> None:
+    assert len(REAL_SCANS) == 15
+    assert all(one.scan.is_file() and one.cad.is_file() for one in REAL_SCANS)
+    assert {one.cad_units for one in REAL_SCANS} == {"mm", "cm"}
