@@ -107,7 +107,7 @@ def test_every_rotation_is_within_44_5_deg_of_one():
 
 def test_a_network_that_changes_nothing_gives_the_guess_back(matcher, scan, monkeypatch):
     """Into the unit sphere and out again; float32 holds 1e-7 of 400 mm, twice."""
-    monkeypatch.setattr(matched_poses, "_follow", lambda *arguments: arguments[-1])
+    monkeypatch.setattr(matched_poses, "_match", lambda *arguments: arguments[-1])
     measured, truth = scan
     asked = guesses(truth)
     found = match_poses(matcher, measured, asked, iterations=1)
@@ -124,7 +124,7 @@ def test_at_the_true_pose_the_clouds_that_the_network_sees_lie_on_each_other(
         seen.update(zip(("source", "target", "inits"), arguments[-3:], strict=True))
         return arguments[-1]
 
-    monkeypatch.setattr(matched_poses, "_follow", look)
+    monkeypatch.setattr(matched_poses, "_match", look)
     measured, truth = scan
     match_poses(matcher, measured, batch(truth), iterations=1)
     source, target, inits = seen["source"], seen["target"], seen["inits"]
@@ -153,7 +153,7 @@ def test_normals_of_the_scan_are_used_and_turned_to_the_sensor(matcher, scan, mo
         seen.update(source=arguments[-3])
         return arguments[-1]
 
-    monkeypatch.setattr(matched_poses, "_follow", look)
+    monkeypatch.setattr(matched_poses, "_match", look)
     measured, truth = scan
     ideal, _ = ideal_scan(vane())
     # marked, so that they are known again

@@ -1,4 +1,4 @@
-"""Registration of a casting with stock all over: the whole way, and at the command line."""
+"""Registration of a casting with uniform stock: the whole way, and at the command line."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_stock_moves_the_part_unless_it_is_estimated() -> None:
     assert refinement.allowance_mm == pytest.approx(STOCK_MM, abs=0.03)
     assert 0 < refinement.allowance_sigma_mm < 0.03
     for most_mm, noted in ((0.0, False), (1.0, True)):
-        assert any("stock is taken to be the same" in n for n in found(most_mm).notes) is noted
+        assert any("stock is assumed to be uniform" in n for n in found(most_mm).notes) is noted
 
 
 def test_the_checks_are_of_the_part_under_its_stock() -> None:

@@ -26,7 +26,6 @@ def verdict(*, competing=(FAR,), limits=None, uncertainty=None, **verification) 
         "checked": np.arange(1000),
     }
     return judge(
-        GOOD.refinement,
         dataclasses.replace(GOOD.verification, **(said | verification)),
         dataclasses.replace(GOOD.uncertainty, **(uncertainty or {})),
         competing,

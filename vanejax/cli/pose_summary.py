@@ -59,7 +59,7 @@ def summary(result: PoseResult, *, color: bool, seconds: Mapping[str, float]) ->
     ]
     if refinement.allowance_sigma_mm:
         lines.append(
-            f"  stock        {_number(refinement.allowance_mm)} mm all over, sigma "
+            f"  stock        {_number(refinement.allowance_mm)} mm uniform, sigma "
             f"{_number(refinement.allowance_sigma_mm)} mm"
         )
     if result.alternatives:

@@ -52,15 +52,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--segment",
         choices=("auto", "off", "on"),
         default="auto",
-        help="take table, clamps and chips out of the scan first: auto (default) does so where "
-        "the scan does not do as it is",
+        help="take table, clamps and chips out of the scan first: auto (default) does so if "
+        "registration of the raw scan fails",
     )
     parser.add_argument(
         "--max-allowance-mm",
         type=float,
         default=0.0,
         metavar="MM",
-        help="for a casting: how much stock it has all over at most; it is then estimated (0)",
+        help="for a casting: the largest uniform stock it may have; it is then estimated (0)",
     )
     parser.add_argument(
         "--sensor",

@@ -122,9 +122,7 @@ def assess(
     )
     verification = _verify(model, points, refinement, tolerance, seed)
     sigma = uncertainty(refinement, part.center)
-    verdict = judge(
-        refinement, verification, sigma, competing, radius_mm=part.radius, limits=limits
-    )
+    verdict = judge(verification, sigma, competing, radius_mm=part.radius, limits=limits)
     alternatives = ()
     if verdict.status == "ambiguous":
         allowed = [other for other in competing if other.preference < limits.least_preference]

@@ -105,8 +105,8 @@ def refine(
 ) -> Refinement:
     """One pose to the limit of what the scan's noise lets one know.
 
-    A casting has stock all over that its CAD model lacks: least squares then moves the part towards
-    the sensor. With ``max_allowance_mm`` a uniform offset along the outward normals is estimated as
+    A casting has stock that its CAD model lacks: least squares then moves the part towards the
+    sensor. With ``max_allowance_mm`` a uniform offset along the outward normals is estimated as
     a seventh unknown, and the pose's information is what is left when the offset is not known
     (the Schur complement).
 

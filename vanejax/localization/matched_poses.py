@@ -38,7 +38,7 @@ def match_poses(
     iterations: int,
     seed: int = 0,
 ) -> RigidTransform:
-    """Follows H guesses of part_from_camera with the network, all in one compiled call.
+    """What the network makes of H guesses of part_from_camera, all in one compiled call.
 
     The scan is prepared as in training: thinned to the matcher's voxels, then ``num_reference
     X / Y`` of its X points drawn, with the Y thinned points of the part.
@@ -62,15 +62,17 @@ def match_poses(
     inits = RigidTransform(
         jnp.asarray(guesses.rotation, jnp.float32), jnp.asarray(shift / radius, jnp.float32)
     )
-    found = jax.device_get(
-        _follow(matcher.model, iterations, _at_once(), matcher.variables, source, target, inits)
+    matched = jax.device_get(
+        _match(matcher.model, iterations, _at_once(), matcher.variables, source, target, inits)
     )
     # float32 rotations are orthonormal to 1e-7 only
-    u, _, vt = np.linalg.svd(np.nan_to_num(np.asarray(found.rotation, np.float64)))
+    u, _, vt = np.linalg.svd(np.nan_to_num(np.asarray(matched.rotation, np.float64)))
     rotation = u @ vt
-    translation = radius * np.asarray(found.translation, np.float64)
+    translation = radius * np.asarray(matched.translation, np.float64)
     translation = translation + matcher.center - rotation @ middle
-    finite = np.isfinite(found.rotation).all(axis=(1, 2)) & np.isfinite(found.translation).all(1)
+    finite = np.isfinite(matched.rotation).all(axis=(1, 2)) & np.isfinite(matched.translation).all(
+        1
+    )
     finite &= np.linalg.det(rotation) > 0
     return RigidTransform(
         np.where(finite[:, None, None], rotation, guesses.rotation),
@@ -84,7 +86,7 @@ def _at_once() -> int | None:
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _follow(
+def _match(
     model: RpmNet,
     iterations: int,
     at_once: int | None,
@@ -100,7 +102,7 @@ def _follow(
     near = neighborhoods(model, source)
     target_features = features(model, variables, target)
 
-    def one(init: RigidTransform) -> RigidTransform:
+    def match(init: RigidTransform) -> RigidTransform:
         return last_match(
             model,
             variables,
@@ -112,25 +114,23 @@ def _follow(
             target_features=target_features,
         ).target_from_source
 
-    return jax.lax.map(one, inits, batch_size=at_once)
+    return jax.lax.map(match, inits, batch_size=at_once)
 
 
 def _source(
     matcher: TrainedMatcher, scan: MeasuredScan, seed: int
 ) -> tuple[PointCloud, np.ndarray]:
     """The scan as the network takes it [num_source], and what its coordinates are about [3]."""
-    points = scan.points[subset(scan.points, THINNED_FROM, seed)]
-    normals = (
-        None if scan.normals is None else scan.normals[subset(scan.points, THINNED_FROM, seed)]
-    )
+    kept = subset(scan.points, THINNED_FROM, seed)
+    points = scan.points[kept]
     thinned = voxel_thin(points, voxel_mm=matcher.voxel_mm)
     sampling = matcher.sampling
     wanted = round(sampling.num_reference * len(thinned) / len(matcher.reference_points))
     chosen = thinned[subset(thinned, int(np.clip(wanted, 16, sampling.num_source)), seed + 1)]
-    if normals is None or scan.sensor_origin is None:
+    if scan.normals is None or scan.sensor_origin is None:
         normals = estimate_normals(points, sensor_origin=scan.sensor_origin, at=chosen)
     else:
-        normals = normals[chosen]
+        normals = scan.normals[kept[chosen]]
     middle = points[chosen].mean(axis=0)
     rows = sampling.num_source
     xyz, unit = np.zeros((rows, 3), np.float32), np.zeros((rows, 3), np.float32)

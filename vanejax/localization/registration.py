@@ -82,8 +82,8 @@ def register(
         `vanejax.scans.segmentation`: "off", "on", or "auto", which does so where registration of
         the raw scan fails, or where more than a third of it is clutter. What touches the part may
         stay.
-      max_allowance_mm: for a casting with stock all over that its CAD model lacks: how much at
-        most. It is then estimated with the pose, see `fine_registration.refine`.
+      max_allowance_mm: for a casting with stock that its CAD model lacks: how much at most,
+        uniform. It is then estimated with the pose, see `fine_registration.refine`.
       sensor: a stereo camera, or a name of `vanejax.scanner.sensor.PRESETS`, whose matching window
         rounds edges off: that is then taken out, see `edge_rounding`. Not with an allowance.
       seed: of all random subsets: same seed, same result.
@@ -135,12 +135,6 @@ class _Task:
             and result.verification.support >= self.limits.least_support
         )
 
-    @contextmanager
-    def timed(self, name: str) -> Iterator[None]:
-        """Adds the wall time of a stage to ``seconds``."""
-        with _timed(self.seconds, name):
-            yield
-
 
 def _register_segment(scan: MeasuredScan, segments: Segments | None, task: _Task) -> PoseResult:
     """The pose of the part in the scan, or in the segment of it that is taken for the part."""
@@ -170,7 +164,7 @@ def _register_from_sensor(scan: MeasuredScan, task: _Task) -> PoseResult:
 
 def _register_points(scan: MeasuredScan, task: _Task, rotations: tuple[int, ...]) -> PoseResult:
     """Tries searches, the cheapest first, until one gives a well supported pose."""
-    with task.timed("set up"):
+    with _timed(task.seconds, "set up"):
         model = measurement_model(task.part, scan.sensor_origin)
     results = []
     for candidates in _search(model, scan, task, rotations):
@@ -191,7 +185,7 @@ def _search(
         if task.weights is not None:
             matched = _match(scan, guesses, task, task.weights.iterations)
             guesses = concatenate(guesses, matched)
-        with task.timed("search"):
+        with _timed(task.seconds, "search"):
             candidates = converge(model, points, guesses, seed=seed)
         yield candidates
         return
@@ -201,11 +195,11 @@ def _search(
         sample = points[subset(points, COMPARED_POINTS, seed)]
         guesses = initial_poses(model, sample, icosahedral_rotations())
         matched = _match(scan, guesses, task, MATCH_ITERATIONS)
-        with task.timed("search"):
+        with _timed(task.seconds, "search"):
             candidates = search(model, points, extra=matched, count=0, seed=seed)
         yield candidates
     for attempt, count in enumerate(rotations):
-        with task.timed("search"):
+        with _timed(task.seconds, "search"):
             candidates = search(model, points, count=count, seed=seed + attempt)
         yield candidates
 
@@ -217,7 +211,7 @@ def _match(
     # it brings JAX, which takes a second that others need not wait
     from vanejax.localization.matched_poses import match_poses
 
-    with task.timed("match"):
+    with _timed(task.seconds, "match"):
         return match_poses(task.weights, scan, guesses, iterations=iterations, seed=task.seed)
 
 
@@ -226,12 +220,12 @@ def _localize(
 ) -> PoseResult:
     """From candidates to a result: compete, choose, refine, verify and judge."""
     points, seed = scan.points, task.seed
-    with task.timed("challenge"):
+    with _timed(task.seconds, "challenge"):
         hypotheses = competing_hypotheses(model, points, candidates, seed=seed)
         poses = choose(model, hypotheses, guess=task.init)
-    with task.timed("refine"):
+    with _timed(task.seconds, "refine"):
         refinement = _refine(model, scan, select(poses, 0), task)
-    with task.timed("verify"):
+    with _timed(task.seconds, "verify"):
         assessment = assess(
             model,
             points,
@@ -271,8 +265,8 @@ def _notes(refinement: Refinement, assessment: Assessment) -> Iterator[str]:
     """What was assumed of the stock, and what only the guess decided."""
     if refinement.allowance_sigma_mm:
         yield (
-            "the stock is taken to be the same all over: what varies of it moves the pose by up to "
-            "as much, which sigma does not know"
+            "the stock is assumed to be uniform: what varies of it moves the pose by up to as much, "
+            "which sigma does not know"
         )
     for other in assessment.ruled_out:
         yield f"a pose turned by {other.rotation_deg:.1f} deg fits as well; the guess rules it out"
@@ -317,6 +311,7 @@ def _check_guess(init: RigidTransform) -> RigidTransform:
 
 @contextmanager
 def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Adds the wall time of a stage to ``seconds``."""
     start = time.perf_counter()
     yield
     seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-from vanejax.localization.pose_result import Refinement, Uncertainty, Verdict, Verification
+from vanejax.localization.pose_result import Uncertainty, Verdict, Verification
 from vanejax.rigid import RigidTransform
 
 
@@ -62,7 +62,6 @@ class CompetingHypothesis:
 
 
 def judge(
-    refinement: Refinement,
     verification: Verification,
     uncertainty: Uncertainty,
     competing: Sequence[CompetingHypothesis],
@@ -72,54 +71,10 @@ def judge(
 ) -> Verdict:
     """The verdict on a refined pose; the first reason that holds is given."""
     limits = limits or Limits()
-    faults = _faults(refinement, verification, radius_mm, limits)
-    if faults:
-        return Verdict("rejected", faults[0])
-    near = [other for other in competing if other.preference < limits.least_preference]
-    if near:
-        other = min(near, key=lambda other: other.preference)
-        better = "better" if len(near) == 1 else "as well or better"
-        return Verdict(
-            "ambiguous",
-            f"the scan fits {_count(len(near))} "
-            + (better if other.preference < -limits.least_preference else "nearly as well")
-            + ": one is turned by "
-            f"{other.rotation_deg:.1f} deg and moved by {other.translation_mm:.2f} mm; "
-            "a view that shows where they differ, or a rough pose, decides",
-        )
-    if verification.support < limits.least_support:
-        return Verdict(
-            "ambiguous",
-            f"only {verification.inlier_share:.0%} of the points lie on the part"
-            + (
-                ""
-                if math.isnan(verification.unmeasured_share)
-                else f", and {verification.unmeasured_share:.0%} of the surface that the sensor "
-                "should have seen was not measured"
-            )
-            + ": crop the scan to the part, and see that it is this part",
-        )
-    noise = verification.tolerance_mm / 3
-    if noise > limits.doubtful_noise * radius_mm:
-        return Verdict(
-            "ambiguous",
-            f"the points lie {noise:.2g} mm off the surface, {noise / radius_mm:.1%} of the part's "
-            "radius: the pose is the best one, but may be off by more than its uncertainty says",
-        )
-    if uncertainty.weakest_rotation_sigma_deg > limits.most_rotation_sigma_deg:
-        return Verdict(
-            "ambiguous",
-            "the scan hardly fixes the rotation about "
-            f"{_axis(uncertainty.weakest_rotation_axis)}: "
-            f"{uncertainty.weakest_rotation_sigma_deg:.2f} deg standard deviation",
-        )
-    if uncertainty.weakest_translation_sigma_mm > limits.most_translation_sigma * radius_mm:
-        return Verdict(
-            "ambiguous",
-            "the scan hardly fixes the position along "
-            f"{_axis(uncertainty.weakest_translation_axis)}: "
-            f"{uncertainty.weakest_translation_sigma_mm:.2f} mm standard deviation",
-        )
+    for reason in _faults(verification, radius_mm, limits):
+        return Verdict("rejected", reason)
+    for reason in _doubts(verification, uncertainty, competing, radius_mm, limits):
+        return Verdict("ambiguous", reason)
     return Verdict(
         "accepted",
         f"{verification.inlier_share:.1%} of the points lie on the part within "
@@ -127,40 +82,82 @@ def judge(
     )
 
 
-def _faults(
-    refinement: Refinement, verification: Verification, radius_mm: float, limits: Limits
-) -> list[str]:
+def _faults(verification: Verification, radius_mm: float, limits: Limits) -> Iterator[str]:
     """What is wrong with a pose, the worst first."""
-    faults = []
     inliers = round(verification.inlier_share * len(verification.checked))
     if inliers < limits.least_inliers:
-        faults.append(f"only {inliers} points lie on the part")
+        yield f"only {inliers} points lie on the part"
     if verification.inlier_share < limits.least_inlier_share:
-        faults.append(
+        yield (
             f"only {verification.inlier_share:.0%} of the points lie on the part "
             f"(within {verification.tolerance_mm:.3g} mm)"
         )
     if verification.violation_share > limits.most_violation_share:
-        faults.append(
+        yield (
             f"{verification.violation_share:.0%} of the points would have been seen through "
             "the part's material"
         )
     if verification.unmeasured_share > limits.most_unmeasured_share:
-        faults.append(
+        yield (
             f"{verification.unmeasured_share:.0%} of the surface that the sensor should have "
             "seen was not measured"
         )
     noise = verification.tolerance_mm / 3
     if noise > limits.most_noise * radius_mm:
-        faults.append(
+        yield (
             f"the points lie {noise:.2g} mm off the surface: the part is not like its CAD model, "
             "or it is another part"
         )
-    return faults
 
 
-def _count(number: int) -> str:
-    return "another pose" if number == 1 else f"{number} other poses"
+def _doubts(
+    verification: Verification,
+    uncertainty: Uncertainty,
+    competing: Sequence[CompetingHypothesis],
+    radius_mm: float,
+    limits: Limits,
+) -> Iterator[str]:
+    """Why a pose without fault may still be another one, the gravest first."""
+    near = [other for other in competing if other.preference < limits.least_preference]
+    if near:
+        best = min(near, key=lambda other: other.preference)
+        better = "better" if len(near) == 1 else "as well or better"
+        yield (
+            f"the scan fits {'another pose' if len(near) == 1 else f'{len(near)} other poses'} "
+            f"{better if best.preference < -limits.least_preference else 'nearly as well'}: "
+            f"one is turned by {best.rotation_deg:.1f} deg and moved by "
+            f"{best.translation_mm:.2f} mm; a view that shows where they differ, or a rough pose, "
+            "decides"
+        )
+    if verification.support < limits.least_support:
+        unmeasured = ""
+        if not math.isnan(verification.unmeasured_share):
+            unmeasured = (
+                f", and {verification.unmeasured_share:.0%} of the surface that the sensor "
+                "should have seen was not measured"
+            )
+        yield (
+            f"only {verification.inlier_share:.0%} of the points lie on the part{unmeasured}: "
+            "crop the scan to the part, and see that it is this part"
+        )
+    noise = verification.tolerance_mm / 3
+    if noise > limits.doubtful_noise * radius_mm:
+        yield (
+            f"the points lie {noise:.2g} mm off the surface, {noise / radius_mm:.1%} of the part's "
+            "radius: the pose is the best one, but may be off by more than its uncertainty says"
+        )
+    if uncertainty.weakest_rotation_sigma_deg > limits.most_rotation_sigma_deg:
+        yield (
+            "the scan hardly fixes the rotation about "
+            f"{_axis(uncertainty.weakest_rotation_axis)}: "
+            f"{uncertainty.weakest_rotation_sigma_deg:.2f} deg standard deviation"
+        )
+    if uncertainty.weakest_translation_sigma_mm > limits.most_translation_sigma * radius_mm:
+        yield (
+            "the scan hardly fixes the position along "
+            f"{_axis(uncertainty.weakest_translation_axis)}: "
+            f"{uncertainty.weakest_translation_sigma_mm:.2f} mm standard deviation"
+        )
 
 
 def _axis(axis: object) -> str:

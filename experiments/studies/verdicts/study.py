@@ -118,7 +118,7 @@ def _row(
     if kind != OTHER_PART:
         angle, shift = scan.error(refinement.part_from_camera)
     verification = assessment.verification
-    alone = judge(refinement, verification, assessment.uncertainty, (), radius_mm=radius_mm)
+    alone = judge(verification, assessment.uncertainty, (), radius_mm=radius_mm)
     return {
         "part": scan.name,
         "sensor": scan.sensor,
