@@ -10,12 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.cad.parametric_vane import guide_vane
 from vanejax.cad.part import Part, part_from_mesh
-from vanejax.cad.surface import Surface
-from vanejax.localization.residuals import RayCasting
+from vanejax.localization.residuals import RayCasting, measurement_model
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
 from vanejax.scanner.ideal_scan import Scan
-from vanejax.scanner.virtual_scanner import Scanner
 
 SMALL = Camera(width=160, height=128)  # sees the vane with 2,300 points
 MIDDLE = Camera(width=400, height=320)  # with 14,000
@@ -49,7 +47,7 @@ def bracket() -> Part:
 @functools.cache
 def model(part: Part) -> RayCasting:
     """The part seen from the scan's origin."""
-    return RayCasting(Scanner(part), Surface(part), np.zeros(3))
+    return measurement_model(part, np.zeros(3))
 
 
 def ideal_scan(

@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.cad.parametric_vane import guide_vane
 from vanejax.cad.part import Part
-from vanejax.cad.surface import Surface
 from vanejax.errors import InputError
-from vanejax.localization.residuals import RayCasting, moved
+from vanejax.localization.pose_batch import stack
+from vanejax.localization.residuals import RayCasting, measurement_model, moved
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, Viewpoints, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scanner
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,7 +40,7 @@ class VaneViews:
     @functools.cached_property
     def model(self) -> RayCasting:
         """Predicts the scans, whose sensor is at their origin."""
-        return RayCasting(Scanner(self.part), Surface(self.part), np.zeros(3))
+        return measurement_model(self.part, np.zeros(3))
 
     def select(self, which: str) -> list[int]:
         """Indices of the views: "test" for the paper's 54, "all", or numbers such as 0,4,8.
@@ -85,7 +84,7 @@ def perturb(
     """
     axis, direction = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
     delta = np.concatenate([np.radians(deg) * axis, mm * direction])
-    batch = moved(part, RigidTransform(pose.rotation[None], pose.translation[None]), delta[None])
+    batch = moved(part, stack(pose), delta[None])
     return RigidTransform(batch.rotation[0], batch.translation[0])
 
 

@@ -11,18 +11,16 @@ from experiments.runner.vane_views import magnitudes, pose_error
 from experiments.studies.verdicts.challenge_parts import challenge_parts
 from experiments.studies.verdicts.depth_camera import random_pose
 from vanejax.cad.part import Part
-from vanejax.cad.surface import Surface
 from vanejax.cli.program import main
 from vanejax.errors import InputError
 from vanejax.localization.edge_rounding import ROUNDS, refine_sharpened, without_rounding
 from vanejax.localization.fine_registration import refine
 from vanejax.localization.pose_result import Refinement
 from vanejax.localization.registration import register
-from vanejax.localization.residuals import RayCasting
+from vanejax.localization.residuals import RayCasting, measurement_model
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.measurement import Measurement, measure
 from vanejax.scanner.sensor import Sensor, preset
-from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.measured_scan import MeasuredScan
 from vanejax.scans.scan_file import save_points
 
@@ -42,7 +40,7 @@ def part() -> Part:
 
 @functools.cache
 def model() -> RayCasting:
-    return RayCasting(Scanner(part()), Surface(part()), np.zeros(3))
+    return measurement_model(part(), np.zeros(3))
 
 
 @functools.cache

@@ -265,8 +265,8 @@ def _notes(refinement: Refinement, assessment: Assessment) -> Iterator[str]:
     """What was assumed of the stock, and what only the guess decided."""
     if refinement.allowance_sigma_mm:
         yield (
-            "the stock is assumed to be uniform: what varies of it moves the pose by up to as much, "
-            "which sigma does not know"
+            "the stock is assumed to be uniform: what varies of it moves the pose by up to as "
+            "much, which sigma does not know"
         )
     for other in assessment.ruled_out:
         yield f"a pose turned by {other.rotation_deg:.1f} deg fits as well; the guess rules it out"

@@ -9,11 +9,9 @@ import numpy as np
 
 from experiments.runner.registrations import Results, measure
 from vanejax.cad.part import Part
-from vanejax.cad.surface import Surface
 from vanejax.localization.fine_registration import refine
-from vanejax.localization.residuals import RayCasting
+from vanejax.localization.residuals import measurement_model
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.training.dataset import ScanSet
 
 
@@ -22,7 +20,7 @@ class FineStep:
 
     def __init__(self, part: Part, scans: ScanSet) -> None:
         self._part, self._scans = part, scans
-        self._model = RayCasting(Scanner(part), Surface(part), np.zeros(3))
+        self._model = measurement_model(part, np.zeros(3))
 
     def __call__(self, results: Results) -> Results:
         """The same registrations, refined: nothing is added to the points that the method had.

@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from experiments.runner.vane_views import pose_error
 from vanejax.cad.part import Part, part_from_mesh
-from vanejax.cad.surface import Surface
 from vanejax.errors import InputError
-from vanejax.localization.residuals import RayCasting
+from vanejax.localization.residuals import RayCasting, measurement_model
 from vanejax.machine.calibration import Calibration, averaged, calibrate
 from vanejax.machine.calibration_cube import SIDE_MM, Cube, cube_faces, cube_of
 from vanejax.rigid import RigidTransform
@@ -90,7 +89,7 @@ class VirtualTestStand:
     @functools.cached_property
     def model(self) -> RayCasting:
         """Predicts the camera's scans of the part."""
-        return RayCasting(Scanner(self.part), Surface(self.part), np.zeros(3))
+        return measurement_model(self.part, np.zeros(3))
 
     @property
     def axis(self) -> np.ndarray:

@@ -37,8 +37,7 @@ from experiments.studies.sensor_fit.sensor_statistics import (
     statistics,
 )
 from vanejax.cad.part import load_part
-from vanejax.cad.surface import Surface
-from vanejax.localization.residuals import RayCasting
+from vanejax.localization.residuals import RayCasting, measurement_model
 from vanejax.plotting.canvas import (
     DEVIATION_COLORMAP,
     INK,
@@ -55,7 +54,6 @@ from vanejax.rigid import RigidTransform
 from vanejax.scanner import measurement
 from vanejax.scanner.camera import Camera, field_of_view_deg
 from vanejax.scanner.sensor import Sensor, consumer_depth
-from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.scan_file import load_scan
 
 FOCAL_PX = (150.0, 300.0)  # between which that of the real camera is sought
@@ -128,7 +126,7 @@ def load(folder: Path) -> list[RealScan]:
     @functools.cache
     def model(cad: Path, units: str) -> RayCasting:
         part = load_part(cad, units=units)
-        return RayCasting(Scanner(part), Surface(part), np.zeros(3))
+        return measurement_model(part, np.zeros(3))
 
     scans = []
     for known in load_truth(folder):

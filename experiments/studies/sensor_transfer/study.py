@@ -34,14 +34,12 @@ from experiments.runner.vane_views import perturb
 from experiments.studies.real_scans.study import RIGHT_DEG, RIGHT_MM, KnownScan, load_truth
 from experiments.train import fit, load_or_scan
 from vanejax.cad.part import Part
-from vanejax.cad.surface import Surface
 from vanejax.errors import InputError
 from vanejax.localization.fine_registration import refine
 from vanejax.localization.matched_poses import match_poses
-from vanejax.localization.residuals import RayCasting
+from vanejax.localization.residuals import measurement_model
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.sensor import preset
-from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.measured_scan import MeasuredScan
 from vanejax.scans.scan_file import load_scan
 from vanejax.training.export import export_workdir
@@ -91,7 +89,7 @@ class Trial:
 
     def __init__(self, part: Part, networks: dict[str, TrainedMatcher]) -> None:
         self.part, self.networks = part, networks
-        self._model = RayCasting(Scanner(part), Surface(part), np.zeros(3))
+        self._model = measurement_model(part, np.zeros(3))
 
     def rows(
         self, known: KnownScan, *, starts: int, rng: np.random.Generator

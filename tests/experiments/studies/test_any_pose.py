@@ -13,7 +13,7 @@ from experiments.runner.vane_views import VaneViews
 from experiments.studies.any_pose import study as any_pose
 from experiments.studies.any_pose.study import main, summarize, table, turned_scan
 from vanejax.errors import InputError
-from vanejax.rigid import RigidTransform
+from vanejax.localization.pose_batch import stack
 from vanejax.scanner.camera import Camera
 
 
@@ -28,9 +28,7 @@ def test_a_turned_scan_is_one_that_a_turned_sensor_would_take(views: VaneViews) 
     still, untouched = turned_scan(views, 40, np.eye(3), noise_mm=0.1, rng=np.random.default_rng(2))
     np.testing.assert_allclose(truth.apply(scan.points), untouched.apply(still.points), atol=1e-9)
     assert (scan.sensor_origin == 0).all()
-    now = views.model.residuals(
-        RigidTransform(truth.rotation[None], truth.translation[None]), scan.points
-    )
+    now = views.model.residuals(stack(truth), scan.points)
     along = now.deviation_mm[0] / now.cosine[0]
     assert now.hit.mean() > 0.99
     # the noise, along the ray

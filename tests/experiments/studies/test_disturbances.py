@@ -10,20 +10,18 @@ import pytest
 from experiments.studies.robustness import disturbances
 from experiments.studies.robustness.disturbances import Disturbed, Series, make_series, saturating
 from vanejax.cad.parametric_vane import guide_vane
-from vanejax.cad.surface import Surface
-from vanejax.localization.residuals import RayCasting
-from vanejax.rigid import RigidTransform
+from vanejax.localization.pose_batch import stack
+from vanejax.localization.residuals import RayCasting, measurement_model
 from vanejax.scanner.camera import hemisphere_viewpoints
 from vanejax.scanner.measurement import Reason, measure
 from vanejax.scanner.sensor import preset
-from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.segmentation import Segment, Segments
 
 
 @pytest.fixture(scope="module")
 def model() -> RayCasting:
     part = guide_vane()
-    return RayCasting(Scanner(part), Surface(part), np.zeros(3))
+    return measurement_model(part, np.zeros(3))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +33,7 @@ def deviations(model: RayCasting, scan: Disturbed) -> np.ndarray:
     """[n] mm of up to 5,000 points that the model predicts at the true pose."""
     pose = scan.part_from_camera
     some = scan.points[:: max(1, len(scan.points) // 5000)]
-    found = model.residuals(RigidTransform(pose.rotation[None], pose.translation[None]), some)
+    found = model.residuals(stack(pose), some)
     return found.deviation_mm[0][found.hit[0]]
 
 

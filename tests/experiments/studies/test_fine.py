@@ -21,8 +21,8 @@ from experiments.studies.fine.study import (
     table,
 )
 from vanejax.errors import InputError
+from vanejax.localization.pose_batch import stack
 from vanejax.localization.residuals import moved
-from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera
 
 VIEW = 40
@@ -36,10 +36,6 @@ def views() -> VaneViews:
 @pytest.fixture(scope="module")
 def points(views: VaneViews) -> np.ndarray:
     return views.points(VIEW)
-
-
-def one(pose: RigidTransform) -> RigidTransform:
-    return RigidTransform(pose.rotation[None], pose.translation[None])
 
 
 def test_the_test_views_are_the_papers(views: VaneViews) -> None:
@@ -74,7 +70,7 @@ def test_the_error_undoes_itself(views: VaneViews) -> None:
     truth = views.truth(VIEW)
     found = perturb(truth, views.part, deg=20.0, mm=9.0, rng=np.random.default_rng(3))
     error = pose_error(found, truth, views.part.center)
-    again = moved(views.part, one(found), error[None])
+    again = moved(views.part, stack(found), error[None])
     np.testing.assert_allclose(again.rotation[0], truth.rotation, atol=1e-12)
     np.testing.assert_allclose(again.translation[0], truth.translation, atol=1e-9)
 
@@ -84,7 +80,7 @@ def test_the_bound_is_that_of_numerical_derivatives(views: VaneViews, points: np
     model = views.model
 
     def ranges(delta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        pose = moved(views.part, one(truth), delta[None])
+        pose = moved(views.part, stack(truth), delta[None])
         directions = points @ pose.rotation[0].T
         origins = np.broadcast_to(pose.translation[0], directions.shape)
         hits = model.scanner.cast(origins, directions)

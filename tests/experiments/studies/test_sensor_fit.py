@@ -22,13 +22,11 @@ from experiments.studies.sensor_fit.sensor_statistics import (
     unlikeness,
 )
 from vanejax.cad.part import part_from_mesh
-from vanejax.cad.surface import Surface
 from vanejax.errors import InputError
-from vanejax.localization.residuals import RayCasting
+from vanejax.localization.residuals import RayCasting, measurement_model
 from vanejax.scanner.camera import Camera, field_of_view_deg, look_at
 from vanejax.scanner.measurement import measure
 from vanejax.scanner.sensor import Sensor, consumer_depth
-from vanejax.scanner.virtual_scanner import Scanner
 
 REAL = Path(__file__).parents[4] / "shared" / "data" / "real_scans"
 GRID = Grid(focal_px=212.3, column_phase=0.21, row_phase=-0.37)
@@ -50,7 +48,7 @@ def model() -> RayCasting:
     ]
     mesh = trimesh.boolean.union(blocks)
     part = part_from_mesh(mesh.vertices, mesh.faces, name="steps")
-    return RayCasting(Scanner(part), Surface(part), np.zeros(3))
+    return measurement_model(part, np.zeros(3))
 
 
 POSE = look_at(np.array([120.0, -150.0, 240.0]), np.array([0.0, 0.0, 10.0]))

@@ -33,7 +33,6 @@ from vanejax.localization.fine_registration import refine
 from vanejax.localization.pose_batch import stack
 from vanejax.localization.registration import register
 from vanejax.localization.residuals import RayCasting, measurement_model
-from vanejax.rigid import RigidTransform
 from vanejax.scans.measured_scan import MeasuredScan
 
 
@@ -78,7 +77,7 @@ def test_scans_lie_on_the_part(parts, model: RayCasting, sensor: str) -> None:
     np.testing.assert_array_equal(one.points, again.points)
     assert 800 < len(one.points) <= MOST_POINTS
     assert one.is_right(one.truth)
-    batch = RigidTransform(one.truth.rotation[None], one.truth.translation[None])
+    batch = stack(one.truth)
     deviation = np.abs(model.residuals(batch, one.points).deviation_mm[0])
     # white noise at the normal is smaller by the cosine; a depth camera is 1 to 2 mm off
     most = {"white": WHITE_MM, "depth_camera": 3.0}.get(sensor, 0.2)
