@@ -185,8 +185,8 @@ def _ply_counts(data: bytes, path: Path) -> dict[str, int]:
     header = data[: max(data.find(b"end_header"), 0)]
     if not data.startswith(b"ply") or not header:
         raise InputError(f"{path}: is no PLY file: it has no header; export it again")
-    found = re.findall(rb"^element\s+(\w+)\s+(\d{1,18})\s*$", header, re.MULTILINE)
-    return {name.decode(): int(count) for name, count in found}
+    elements = re.findall(rb"^element\s+(\w+)\s+(\d{1,18})\s*$", header, re.MULTILINE)
+    return {name.decode(): int(count) for name, count in elements}
 
 
 def _gltf_counts(data: bytes, path: Path) -> dict[str, int]:
@@ -226,7 +226,7 @@ def _glb_of_step(data: bytes, path: Path, units: str) -> bytes:
 def _step_unit(data: bytes) -> str | None:
     """The unit of length of a STEP file, None where it names none or several."""
     names = {"MILLI": "mm", "CENTI": "cm", "MICRO": "um", "": "m", "INCH": "in", "FOOT": "ft"}
-    found = set()
+    units = set()
     for listed in re.findall(rb"GLOBAL_UNIT_ASSIGNED_CONTEXT\s*\(\s*\(([^)]*)\)", data):
         for entity in re.findall(rb"#\d+", listed):
             match = re.search(rb"(?<!\w)" + entity + rb"\s*=\s*([^;]*);", data)
@@ -236,8 +236,8 @@ def _step_unit(data: bytes) -> str | None:
             si = re.search(r"SI_UNIT\s*\(\s*(?:\.(\w+)\.|\$)\s*,\s*\.METRE\.", body)
             based = re.search(r"CONVERSION_BASED_UNIT\s*\(\s*'(\w+)'", body)
             name = (si.group(1) or "") if si else based.group(1) if based else "?"
-            found.add(names.get(name))
-    return found.pop() if len(found) == 1 else None
+            units.add(names.get(name))
+    return units.pop() if len(units) == 1 else None
 
 
 READERS: dict[str, Callable[[bytes, Path, str], Mesh]] = {

@@ -148,7 +148,7 @@ def offset_directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
         return np.einsum("vij,vj->vi", blocks, flat.reshape(-1, 3))
 
     size = (start.size, start.size)
-    found, _ = cg(
+    directions, _ = cg(
         LinearOperator(
             size, lambda flat: (product(local, flat) + smooth @ flat.reshape(-1, 3)).ravel()
         ),
@@ -158,7 +158,7 @@ def offset_directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
         maxiter=500,
         M=LinearOperator(size, lambda flat: product(inverse, flat).ravel()),
     )
-    return found.reshape(-1, 3)
+    return directions.reshape(-1, 3)
 
 
 def _mitres(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:

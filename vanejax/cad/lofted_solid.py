@@ -27,10 +27,10 @@ def loft_sections(rings: np.ndarray, flat: tuple[int, int]) -> manifold3d.Manifo
     stations, count, _ = rings.shape
     axial, angle, radius = np.moveaxis(rings, -1, 0)
     vertices = np.stack([radius * np.sin(angle), radius * np.cos(angle), -axial], -1)
-    here = np.arange(count)
-    beyond = np.roll(here, -1)
+    corner = np.arange(count)
+    after = np.roll(corner, -1)
     rows = count * np.arange(stations - 1)[:, None]
-    quads = np.stack([rows + here, rows + beyond, rows + count + beyond, rows + count + here], -1)
+    quads = np.stack([rows + corner, rows + after, rows + count + after, rows + count + corner], -1)
     # angles are in radians: at the size of the ring they are as long as the axial coordinates
     scaled = rings * [1.0, radius.mean(), 1.0]
     ends = [manifold3d.triangulate([scaled[i][:, flat]]) for i in (0, -1)]

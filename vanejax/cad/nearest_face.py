@@ -41,8 +41,8 @@ class NearestFace:
         self._radii = np.linalg.norm(self._corners - middles[:, None], axis=2).max(axis=1)
         size = np.ceil(np.log2(np.maximum(self._radii, 1e-6)))
         # a face without area is the edge of its neighbours
-        some = double_area > 0
-        self._sizes = [np.flatnonzero(some & (size == v)) for v in np.unique(size[some])]
+        has_area = double_area > 0
+        self._sizes = [np.flatnonzero(has_area & (size == v)) for v in np.unique(size[has_area])]
         self._trees = [cKDTree(middles[faces]) for faces in self._sizes]
 
     def closest_points(self, points: np.ndarray) -> ClosestPoints:
@@ -51,17 +51,17 @@ class NearestFace:
         Where several faces share one, at an edge or a corner, that which faces the point or turns
         from it most: the side of that face is the side of the solid.
         """
-        found = [
-            self._some(points[first : first + PAIRS_AT_ONCE // FIRST_FACES])
+        blocks = [
+            self._nearest_of(points[first : first + PAIRS_AT_ONCE // FIRST_FACES])
             for first in range(0, len(points), PAIRS_AT_ONCE // FIRST_FACES)
         ]
         return ClosestPoints(
-            np.concatenate([closest.points for closest in found]),
-            np.concatenate([closest.normals for closest in found]),
-            np.concatenate([closest.face for closest in found]),
+            np.concatenate([closest.points for closest in blocks]),
+            np.concatenate([closest.normals for closest in blocks]),
+            np.concatenate([closest.face for closest in blocks]),
         )
 
-    def _some(self, points: np.ndarray) -> ClosestPoints:
+    def _nearest_of(self, points: np.ndarray) -> ClosestPoints:
         best = np.full(len(points), np.inf)
         closest = ClosestPoints(
             np.zeros((len(points), 3)), np.zeros((len(points), 3)), np.zeros(len(points), np.int64)
@@ -71,15 +71,15 @@ class NearestFace:
             rows, first, last = np.arange(len(points)), 0, min(FIRST_FACES, len(faces))
             while len(rows):
                 ended = []
-                for some in np.array_split(rows, 1 + len(rows) * last // PAIRS_AT_ONCE):
-                    middle, order = tree.query(points[some], k=range(first + 1, last + 1))
-                    self._look(points, some, faces[order], middle, best, closest)
-                    ended.append(middle[:, -1] - largest > best[some] + TIE_MM)
+                for block in np.array_split(rows, 1 + len(rows) * last // PAIRS_AT_ONCE):
+                    middle, order = tree.query(points[block], k=range(first + 1, last + 1))
+                    self._try_faces(points, block, faces[order], middle, best, closest)
+                    ended.append(middle[:, -1] - largest > best[block] + TIE_MM)
                 rows = rows[~np.concatenate(ended)] if last < len(faces) else rows[:0]
                 first, last = last, min(2 * last, len(faces))
         return closest
 
-    def _look(
+    def _try_faces(
         self,
         points: np.ndarray,
         rows: np.ndarray,

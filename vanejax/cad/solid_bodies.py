@@ -39,12 +39,12 @@ def wind_consistently(mesh: Triangles, name: str, notes: list[str]) -> tuple[Tri
     edges, count = mesh.edges, len(mesh.faces)
     paired = edges.order[np.repeat(edges.uses == 2, edges.uses)].reshape(-1, 2)
     paired = np.concatenate([paired, *_wedges(mesh, edges)])
-    one, two = (paired // 3).T
+    first, second = (paired // 3).T
     turned = edges.ends[paired[:, 0], 0] == edges.ends[paired[:, 1], 0]
     if not turned.any():  # then the two halves of the cover are alike and apart
-        return mesh, connected(np.stack([one, two], axis=1), count)[1]
-    other = two + np.where(turned, count, 0)
-    cover = np.stack([np.r_[one, one + count], np.r_[other, (other + count) % (2 * count)]], 1)
+        return mesh, connected(np.stack([first, second], axis=1), count)[1]
+    other = second + np.where(turned, count, 0)
+    cover = np.stack([np.r_[first, first + count], np.r_[other, (other + count) % (2 * count)]], 1)
     _, label = connected(cover, 2 * count)
     as_is, flipped = label[:count], label[count:]
     if np.any(as_is == flipped):

@@ -272,12 +272,12 @@ def _tool_path(
     if compensation is not None:
         rows.append(("as programmed", programmed))
     for words, points in rows:
-        found = tool_path_deviation(
+        deviation = tool_path_deviation(
             points.points, surface, machine_from_part, tolerance_mm=arguments.tolerance_mm
         )
-        near = f"{found.share_within:.1%} within {arguments.tolerance_mm:g} mm"
+        near = f"{deviation.share_within:.1%} within {arguments.tolerance_mm:g} mm"
         lines.append(
-            f"  {words + ':':15}off the part as measured by {found.mean_mm:.4f} mm on average, "
-            f"{found.largest_mm:.4f} mm at most; {near}"
+            f"  {words + ':':15}off the part as measured by {deviation.mean_mm:.4f} mm on average, "
+            f"{deviation.largest_mm:.4f} mm at most; {near}"
         )
     return lines

@@ -20,6 +20,6 @@ def run(arguments: argparse.Namespace) -> int:
     """
     from vanejax.cli.inspection import inspect
 
-    found = inspect(arguments.file)
-    print(json.dumps(found.to_dict(), indent=2) if arguments.json else found.text())
+    inspection = inspect(arguments.file)
+    print(json.dumps(inspection.to_dict(), indent=2) if arguments.json else inspection.text())
     return 0

@@ -291,8 +291,8 @@ def _inspect_weights(path: Path, arrays: dict[str, str]) -> Inspection:
     try:
         matcher = load_model(path)
     except InputError as error:
-        found = _inspect_arrays(path, arrays)
-        return dataclasses.replace(found, notes=(*found.notes, str(error)))
+        inspection = _inspect_arrays(path, arrays)
+        return dataclasses.replace(inspection, notes=(*inspection.notes, str(error)))
     notes = (
         f"trained for the part {matcher.part_name} (sha256 {matcher.part_sha256[:12]}), radius "
         f"{matcher.radius_mm:.4g} mm",

@@ -137,7 +137,7 @@ def _write_scans(
 
     scanner = Scanner(part)
 
-    def one(view: int) -> int:
+    def write_view(view: int) -> int:
         try:
             scan = scanner.scan(camera, viewpoints.view(view))
         except InputError as error:
@@ -148,7 +148,7 @@ def _write_scans(
 
     # an error, or Ctrl-C, leaves the generator of `map`, which cancels the views not yet begun
     with ThreadPoolExecutor() as pool:
-        counts = pool.map(one, views)
+        counts = pool.map(write_view, views)
         return list(tqdm(counts, "scanning", len(views), unit="view", disable=arguments.quiet))
 
 

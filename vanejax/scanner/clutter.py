@@ -232,8 +232,8 @@ def _places(
     # as many again, for those that fall through where there is no table
     aside = rng.uniform(low - around, high + around, (4 * count, 2))
     hits, height = _seen_from_above(below, aside)
-    found = np.flatnonzero(hits.face >= 0)[:count]
-    return np.column_stack([aside, height])[found], hits.normals[found]
+    on_surface = np.flatnonzero(hits.face >= 0)[:count]
+    return np.column_stack([aside, height])[on_surface], hits.normals[on_surface]
 
 
 def _seen_from_above(below: Scanner, aside: np.ndarray) -> tuple[Hits, np.ndarray]:

@@ -73,9 +73,9 @@ class PartEnvelope:
         extent = np.full(SIDES, -np.inf)
         radius = 0.0
         for first in range(0, len(vertices), VERTICES_AT_ONCE):
-            some = vertices[first : first + VERTICES_AT_ONCE] - inside
-            np.maximum(extent, (some @ outward.T).max(axis=0), out=extent)
-            radius = max(radius, np.linalg.norm(some, axis=-1).max())
+            block = vertices[first : first + VERTICES_AT_ONCE] - inside
+            np.maximum(extent, (block @ outward.T).max(axis=0), out=extent)
+            radius = max(radius, np.linalg.norm(block, axis=-1).max())
         halfspaces = np.column_stack([outward, -(extent + PADDING * radius)])
         met = scipy.spatial.HalfspaceIntersection(halfspaces, np.zeros(3)).intersections
         hull = scipy.spatial.ConvexHull(met)

@@ -95,8 +95,8 @@ class PixelRays:
         turn[:3, 3] = rotation.T @ translation
         turned = np.empty_like(planes)
         for first in range(0, len(planes), PLANES_AT_ONCE):
-            some = slice(first, first + PLANES_AT_ONCE)
-            np.matmul(planes[some], turn, out=turned[some])
+            block = slice(first, first + PLANES_AT_ONCE)
+            np.matmul(planes[block], turn, out=turned[block])
         if self.backs:
             turned *= -np.sign(turned[:, 3:])
         return turned

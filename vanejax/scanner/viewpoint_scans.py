@@ -52,7 +52,7 @@ def scan_views(
         raise InputError(f"workers must be at least 1, got {workers}")
     scanner = Scanner(part)
 
-    def one(index: int) -> T:
+    def scan_view(index: int) -> T:
         try:
             scan = scanner.scan(camera, viewpoints.view(index), hidden=hidden)
         except InputError as error:
@@ -63,6 +63,6 @@ def scan_views(
 
     # an error, or Ctrl-C, leaves the generator of `map`, which cancels the views not yet begun
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
-        results = pool.map(one, range(len(viewpoints)))
+        results = pool.map(scan_view, range(len(viewpoints)))
         bar = tqdm(results, "scanning", len(viewpoints), unit="view", disable=not progress)
         return list(bar)

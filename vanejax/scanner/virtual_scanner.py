@@ -51,8 +51,8 @@ class Scanner:
         """Faces and their corners [K, 3, 3] f64, mm, about the centre: not all at a time."""
         vertices, faces = np.asarray(self.part.mesh.vertices), np.asarray(self.part.mesh.faces)
         for first in range(0, len(faces), FACES_AT_ONCE):
-            some = slice(first, min(first + FACES_AT_ONCE, len(faces)))
-            yield some, vertices[faces[some]] - self._center
+            block = slice(first, min(first + FACES_AT_ONCE, len(faces)))
+            yield block, vertices[faces[block]] - self._center
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """First intersections of any rays with the part, seen from outside.
@@ -282,8 +282,8 @@ def _turned(vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """Rows [N, 3] times ``turn`` [3, 3], by blocks for which BLAS starts no threads."""
     turned = np.empty_like(vectors)
     for first in range(0, len(vectors), FACES_AT_ONCE):
-        some = slice(first, first + FACES_AT_ONCE)
-        np.matmul(vectors[some], turn, out=turned[some])
+        block = slice(first, first + FACES_AT_ONCE)
+        np.matmul(vectors[block], turn, out=turned[block])
     return turned
 
 

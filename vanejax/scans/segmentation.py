@@ -69,8 +69,8 @@ def is_larger(points: np.ndarray, part: Part) -> bool:
 
     Then they are not of the part alone; where they are not, there may still be other things.
     """
-    some = points[sampled_rows(len(points), 2_000)]
-    low, high = np.quantile(some @ _directions().T, [0.01, 0.99], axis=0)
+    sample = points[sampled_rows(len(points), 2_000)]
+    low, high = np.quantile(sample @ _directions().T, [0.01, 0.99], axis=0)
     return bool(np.any(np.sort(high - low) > _allowed_mm(_part_widths(part), part)))
 
 
@@ -94,14 +94,14 @@ def segment(
     voxels = _voxels(points, part)
     tables = find_tables(voxels, part, sensor_origin, seed)
     label = np.full(len(points), Segment.PART, np.uint8)
-    some = points[sampled_rows(len(points), THICKNESS_POINTS)]
-    tables = tuple(with_noise_thickness(table, some, part) for table in tables)
+    sample = points[sampled_rows(len(points), THICKNESS_POINTS)]
+    tables = tuple(with_noise_thickness(table, sample, part) for table in tables)
     for table in tables:
         label[np.abs(table.height_mm(points)) <= table.thickness_mm] = Segment.TABLE
     rest = np.flatnonzero(label == Segment.PART)
     if len(rest):
-        mine = _part_of(points[rest], part, voxels.size_mm, tables, sensor_origin)
-        label[rest[~mine]] = Segment.OTHER
+        is_part = _part_of(points[rest], part, voxels.size_mm, tables, sensor_origin)
+        label[rest[~is_part]] = Segment.OTHER
     return Segments(label, tables)
 
 
@@ -143,9 +143,9 @@ def _part_of(
     order = np.argsort(-supports.count, kind="stable")
     large = order[: np.count_nonzero(supports.count >= LEAST_PIECE * supports.count[order[0]])]
     chosen = _likeliest(supports, large[:MOST_PIECES], wanted, allowed)
-    mine = supports.together(chosen)
+    main_piece = supports.together(chosen)
     small = np.setdiff1d(order, large)
-    fits = np.all(supports.widths(mine)[small] <= np.maximum(allowed, mine.widths()), 1)
+    fits = np.all(supports.widths(main_piece)[small] <= np.maximum(allowed, main_piece.widths()), 1)
     if tables:
         height = np.min(
             [table.height_mm(voxels.middle) - table.thickness_mm for table in tables], 0

@@ -47,27 +47,27 @@ def find_tables(
     """The planes that are none of the part's, largest first."""
     rng = np.random.default_rng([seed, len(voxels.of_point)])
     middle = voxels.middle
-    left, untried = np.ones(len(middle), bool), np.ones(len(middle), bool)
+    remaining, untried = np.ones(len(middle), bool), np.ones(len(middle), bool)
     tables: list[Plane] = []
     for _ in range(PLANES_TRIED):
-        some = middle[left & untried]
-        if len(some) < 3:
+        untried_points = middle[remaining & untried]
+        if len(untried_points) < 3:
             break
-        plane = _best_plane(some, part, rng)
+        plane = _best_plane(untried_points, part, rng)
         on = np.abs(plane.height_mm(middle)) <= plane.thickness_mm
-        standing = _standing(plane, middle[left & ~on], sensor_origin)
-        if standing is not None and _is_beyond(part, plane, middle[left & on], voxels.size_mm):
+        standing = _standing(plane, middle[remaining & ~on], sensor_origin)
+        if standing is not None and _is_beyond(part, plane, middle[remaining & on], voxels.size_mm):
             tables.append(standing)
-            left &= ~on
+            remaining &= ~on
         untried &= ~on
     return tuple(tables)
 
 
 def _best_plane(middle: np.ndarray, part: Part, rng: np.random.Generator) -> Plane:
     """The plane through three of the points [V, 3] that most others lie on, fitted to those."""
-    some = middle[rng.integers(len(middle), size=min(TRIPLET_POINTS, len(middle)))]
+    sample = middle[rng.integers(len(middle), size=min(TRIPLET_POINTS, len(middle)))]
     normal, offset = _random_planes(middle, rng)
-    on = np.count_nonzero(np.abs(some @ normal.T - offset) <= PLANE_REACH * part.radius, axis=0)
+    on = np.count_nonzero(np.abs(sample @ normal.T - offset) <= PLANE_REACH * part.radius, axis=0)
     best = int(np.argmax(on))
     plane = Plane(normal[best], float(offset[best]), 2 * PLANE_REACH * part.radius)
     for _ in range(3):
@@ -150,7 +150,7 @@ def largest_slab_mm2(part: Part, thickness_mm: float, *, seed: int = 0) -> float
     Of both sides and of curved surface too: a table must be larger than what any view could take
     for one.
     """
-    some = part.sample(4_000, seed)[0]
-    normal, offset = _random_planes(some, np.random.default_rng(seed))
-    on = np.abs(some @ normal.T - offset) <= thickness_mm
+    sample = part.sample(4_000, seed)[0]
+    normal, offset = _random_planes(sample, np.random.default_rng(seed))
+    on = np.abs(sample @ normal.T - offset) <= thickness_mm
     return float(part.triangles.areas().sum() * np.mean(on, axis=0).max())

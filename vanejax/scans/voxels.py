@@ -61,10 +61,10 @@ class Voxels:
         for step in itertools.product((-1, 0, 1), repeat=3):
             if step <= (0, 0, 0):
                 continue
-            beside = code + np.dot(step, (span[1] * span[2], span[2], 1))
-            place = np.minimum(np.searchsorted(code, beside), len(code) - 1)
-            there = np.flatnonzero(code[place] == beside)
-            pairs.append(np.stack([there, place[there]]))
+            neighbor_code = code + np.dot(step, (span[1] * span[2], span[2], 1))
+            place = np.minimum(np.searchsorted(code, neighbor_code), len(code) - 1)
+            has_neighbor = np.flatnonzero(code[place] == neighbor_code)
+            pairs.append(np.stack([has_neighbor, place[has_neighbor]]))
         return np.concatenate(pairs, axis=1)
 
     def clusters(self) -> np.ndarray:
