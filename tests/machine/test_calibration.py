@@ -75,20 +75,6 @@ def error(found: RigidTransform, center: np.ndarray) -> np.ndarray:
     return np.concatenate([Rotation.from_matrix(left.rotation).as_rotvec(), shift])
 
 
-def test_a_plane_is_that_of_least_squares():
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-30, 30, (15, 3)) * [1, 1, 0.01] + [100.0, 0, 50]
-    face = fit_face(points)
-
-    def cost(normal: np.ndarray) -> float:
-        return float(np.sum(((points - points.mean(axis=0)) @ normal) ** 2))
-
-    for tilt in 1e-3 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]):
-        assert cost(face.normal) < cost(Rotation.from_rotvec(tilt).apply(face.normal))
-    assert face.rms_mm == pytest.approx(np.sqrt(cost(face.normal) / 15))
-    np.testing.assert_allclose(face.center, points.mean(axis=0))
-
-
 def test_strays_do_not_move_a_plane():
     rng = np.random.default_rng(1)
     points = face_points(2, rng.uniform(-60, 0, (500, 2)))
@@ -222,7 +208,7 @@ def test_exact_cubes_give_the_exact_frame(method, touched):
 @pytest.mark.slow
 def test_the_joint_fit_is_honest_and_better_than_the_mean():
     """Both over 40 sets of 8 placements: errors by their covariance, and side by side."""
-    joint, mean, chi = [], [], []
+    joint, mean, chi, spread = [], [], [], []
     for seed in range(40):
         cubes = placements(100 + seed, camera_mm=0.05, probe_mm=0.015, touched=5)
         found, other = calibrate(*cubes), averaged(*cubes)
@@ -230,12 +216,14 @@ def test_the_joint_fit_is_honest_and_better_than_the_mean():
         chi.append(e @ np.linalg.solve(found.covariance / max(1, found.misfit**2), e))
         joint.append(e)
         mean.append(error(other.machine_from_camera, other.center))
+        spread.append(np.diag(other.covariance))
         assert 0.6 < found.misfit < 1.6  # 66 freedoms: 1 +- 0.09
     # chi square of 6 freedoms, 40 times: 6 +- 0.55
     assert 4.3 < np.mean(chi) < 7.7
     rms = [np.sqrt(np.mean(np.square(errors), axis=0)) for errors in (joint, mean)]
     assert np.linalg.norm(rms[0][:3]) < 0.95 * np.linalg.norm(rms[1][:3])
     assert np.linalg.norm(rms[0][3:]) < 0.95 * np.linalg.norm(rms[1][3:])
+    assert 0.6 < np.mean(np.square(rms[1]) / np.mean(spread, axis=0)) < 1.6
 
 
 @pytest.mark.slow
@@ -250,17 +238,6 @@ def test_planes_that_were_touched_at_one_end_are_weighed_by_their_lever():
         misfit.append(found.misfit)
     assert 4.3 < np.mean(chi) < 7.7  # 6 +- 0.55
     assert np.mean(np.square(misfit)) == pytest.approx(1, abs=0.1)  # 2,640 freedoms: 3 %
-
-
-@pytest.mark.slow
-def test_the_mean_tells_its_spread():
-    errors, told = [], []
-    for seed in range(40):
-        found = averaged(*placements(200 + seed, camera_mm=0.05, probe_mm=0.015, touched=5))
-        errors.append(error(found.machine_from_camera, found.center))
-        told.append(np.diag(found.covariance))
-    ratio = np.mean(np.square(errors), axis=0) / np.mean(told, axis=0)
-    assert 0.6 < np.mean(ratio) < 1.6
 
 
 def test_a_cube_that_is_not_square_does_not_matter():
@@ -297,18 +274,3 @@ def test_faces_cannot_be_told_where_the_cube_stays():
     assert matched(camera, machine)[0] is not None  # as it is given
     with pytest.raises(InputError, match="which face of the cube is which cannot be told"):
         calibrate(camera * 2, machine * 2)
-
-
-def test_moved_sideways_is_enough_to_tell_faces():
-    rng = np.random.default_rng(9)
-    frame = placement(rng)
-    cubes: tuple[list[Cube], list[Cube]] = ([], [])
-    for shift in ([0.0, 0, 0], [30.0, 0, 0], [0, 30.0, 5]):
-        there = RigidTransform(frame.rotation, frame.translation + shift)
-        for mine, place in zip(cubes, (there, MACHINE_FROM_CAMERA @ there), strict=True):
-            points = [place.apply(face_points(k, rng.uniform(-58, -2, (5, 2)))) for k in range(3)]
-            mine.append(cube_of(points))
-    found = calibrate([cube.relabelled(2) for cube in cubes[0]], cubes[1])
-    np.testing.assert_allclose(
-        found.machine_from_camera.as_matrix(), MACHINE_FROM_CAMERA.as_matrix(), atol=1e-5
-    )

@@ -19,10 +19,7 @@ from vanejax.machine.controllers import Compensation, axis_angle_deg, read_frame
 from vanejax.machine.frame_notation import (
     NOTATIONS,
     notation_of,
-    read_heidenhain,
     read_iso,
-    read_kuka,
-    read_siemens,
     write_iso,
 )
 from vanejax.rigid import RigidTransform
@@ -82,27 +79,6 @@ def test_without_rounding_nothing_is_lost(name: str, rotation: Rotation) -> None
 
 
 ANGLE = st.floats(-180, 180).map(lambda v: round(v, 6))
-
-
-@given(ANGLE, ANGLE, ANGLE)
-def test_the_conventions_are_those_of_scipy(a: float, b: float, c: float) -> None:
-    """Capitals turn about the moved axes, small letters about the fixed ones."""
-    cases = [
-        (read_kuka(f"{{X 1,Y 2,Z 3,A {a:f},B {b:f},C {c:f}}}"), "ZYX"),
-        (read_iso(f"G10 L2 P1 X1 Y2 Z3\nG68.2 X0 Y0 Z0 I{a:f} J{b:f} K{c:f}"), "ZXZ"),
-        (read_siemens(f"CTRANS(X,1,Y,2,Z,3):CROT(Z,{a:f},Y,{b:f},X,{c:f})"), "ZYX"),
-        (
-            read_heidenhain(
-                "CYCL DEF 7.1 X+1\nCYCL DEF 7.2 Y+2\nCYCL DEF 7.3 Z+3\n"
-                f"PLANE SPATIAL SPA{a:+f} SPB{b:+f} SPC{c:+f} STAY"
-            ),
-            "xyz",
-        ),
-    ]
-    for found, order in cases:
-        expected = Rotation.from_euler(order, [a, b, c], degrees=True).as_matrix()
-        np.testing.assert_allclose(found.rotation, expected, rtol=0, atol=1e-14)
-        np.testing.assert_array_equal(found.translation, [1, 2, 3])
 
 
 @pytest.mark.parametrize(

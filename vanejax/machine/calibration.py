@@ -34,8 +34,7 @@ class Calibration:
       covariance: [6, 6] of its error, a small motion in the machine's frame about ``center``
         applied after it, see `vanejax.machine.positioning`; (rad, mm).
       center: [3] mm, machine frame: the middle of the cubes' corners.
-      rotation_deg: [P], of each placement's cube frame, left over.
-      corner_mm: [P], of its corner.
+      rotation_deg, corner_mm: [P], residual of each placement's cube frame and of its corner.
       misfit: root of chi square per degree of freedom: 1 where the cubes fit as well as their
         noise lets them. Above it the covariance has been enlarged by its square. NaN from
         `averaged`, which knows no noise.
@@ -75,27 +74,24 @@ def calibrate(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> Ca
     for _ in range(20):
         information, gradient, chi = np.zeros((6, 6)), np.zeros(6), 0.0
         for seen, touched in zip(camera_cubes, machine_cubes, strict=True):
-            for one, other in zip(
+            for face, touched_face in zip(
                 seen.moved(machine_from_camera).faces, touched.faces, strict=True
             ):
-                residual, jacobian, covariance = _disagreement(one, other, center)
+                residual, jacobian, covariance = _disagreement(face, touched_face, center)
                 weighted = np.linalg.solve(covariance, np.column_stack([jacobian, residual]))
                 information += jacobian.T @ weighted[:, :6]
                 gradient += jacobian.T @ weighted[:, 6]
                 chi += float(residual @ weighted[:, 6])
         step = -np.linalg.solve(information, gradient)
-        machine_from_camera = _nudged(machine_from_camera, step, center)
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        shift = center + step[3:] - turn @ center
+        machine_from_camera = RigidTransform(turn, shift) @ machine_from_camera
         if step @ information @ step < 1e-12:
             break
-    free = 9 * len(camera_cubes) - 6
-    misfit = float(np.sqrt(chi / free))
-    return _judged(
-        machine_from_camera,
-        np.linalg.inv(information) * max(1.0, misfit**2),
-        center,
-        camera_cubes,
-        machine_cubes,
-        misfit,
+    misfit = float(np.sqrt(chi / (9 * len(camera_cubes) - 6)))
+    covariance = np.linalg.inv(information) * max(1.0, misfit**2)
+    return _with_residuals(
+        machine_from_camera, covariance, center, camera_cubes, machine_cubes, misfit
     )
 
 
@@ -116,26 +112,14 @@ def averaged(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> Cal
         for seen, touched in zip(camera_cubes, machine_cubes, strict=True)
     ]
     turns = Rotation.from_matrix([b.rotation @ a.rotation.T for b, a in frames])
-    rotation = turns.mean().as_matrix()
-    shifts = np.stack([b.translation - rotation @ a.translation for b, a in frames])
+    mean = turns.mean()
+    shifts = np.stack([b.translation - mean.apply(a.translation) for b, a in frames])
+    pose = RigidTransform(mean.as_matrix(), shifts.mean(axis=0))
     center = np.mean([b.translation for b, _ in frames], axis=0)
-    errors = np.concatenate(
-        [
-            (turns * Rotation.from_matrix(rotation).inv()).as_rotvec(),
-            shifts - shifts.mean(axis=0),
-        ],
-        axis=1,
-    )
+    errors = np.column_stack([(turns * mean.inv()).as_rotvec(), shifts - pose.translation])
     count = len(frames)
     spread = errors.T @ errors / (count * (count - 1)) if count > 1 else np.full((6, 6), np.nan)
-    return _judged(
-        RigidTransform(rotation, shifts.mean(axis=0)),
-        spread,
-        center,
-        camera_cubes,
-        machine_cubes,
-        float("nan"),
-    )
+    return _with_residuals(pose, spread, center, camera_cubes, machine_cubes, float("nan"))
 
 
 def matched(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> list[Cube]:
@@ -229,15 +213,7 @@ def _disagreement(
     return residual, jacobian, covariance + np.diag([1e-14, 1e-14, 1e-10])
 
 
-def _nudged(pose: RigidTransform, step: np.ndarray, center: np.ndarray) -> RigidTransform:
-    """The pose with a small motion [6] about ``center`` after it."""
-    turn = Rotation.from_rotvec(step[:3]).as_matrix()
-    return RigidTransform(
-        turn @ pose.rotation, turn @ (pose.translation - center) + center + step[3:]
-    )
-
-
-def _judged(
+def _with_residuals(
     machine_from_camera: RigidTransform,
     covariance: np.ndarray,
     center: np.ndarray,
@@ -245,13 +221,13 @@ def _judged(
     machine_cubes: Sequence[Cube],
     misfit: float,
 ) -> Calibration:
-    """With what is left over at each placement."""
-    turn_deg, corner_mm = [], []
+    """A calibration with the residuals of its placements."""
+    rotation_deg, corner_mm = [], []
     for seen, touched in zip(camera_cubes, machine_cubes, strict=True):
-        one, other = machine_from_camera @ seen.world_from_cube, touched.world_from_cube
-        left = Rotation.from_matrix(other.rotation @ one.rotation.T)
-        turn_deg.append(float(np.degrees(left.magnitude())))
-        corner_mm.append(float(np.linalg.norm(other.translation - one.translation)))
+        pose, touched_pose = machine_from_camera @ seen.world_from_cube, touched.world_from_cube
+        rest = Rotation.from_matrix(touched_pose.rotation @ pose.rotation.T)
+        rotation_deg.append(float(np.degrees(rest.magnitude())))
+        corner_mm.append(float(np.linalg.norm(touched_pose.translation - pose.translation)))
     return Calibration(
-        machine_from_camera, covariance, center, np.array(turn_deg), np.array(corner_mm), misfit
+        machine_from_camera, covariance, center, np.array(rotation_deg), np.array(corner_mm), misfit
     )

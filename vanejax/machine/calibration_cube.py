@@ -56,11 +56,7 @@ class Face:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Cube:
-    """Three faces of a cube, outward and right-handed: ``n0 x n1`` is along n2.
-
-    Attributes:
-      faces: the three.
-    """
+    """Three faces of a cube, outward and right-handed: ``n0 x n1`` is along n2."""
 
     faces: tuple[Face, Face, Face]
 
@@ -72,10 +68,7 @@ class Cube:
 
     @property
     def world_from_cube(self) -> RigidTransform:
-        """The cube's frame: origin at the corner, axes nearest to the three normals.
-
-        Nearest in the sum of squares, all three alike: no face is the first.
-        """
+        """The cube's frame: origin at the corner, axes nearest (least squares) to the normals."""
         normals = np.stack([face.normal for face in self.faces])
         axes = Rotation.align_vectors(normals, np.eye(3))[0].as_matrix()
         return RigidTransform(axes, self.corner)
@@ -86,18 +79,17 @@ class Cube:
 
     def moved(self, target_from_this: RigidTransform) -> Cube:
         """The same in another frame."""
-        turn = target_from_this.rotation
-        return Cube(
-            tuple(
-                dataclasses.replace(
-                    face,
-                    normal=turn @ face.normal,
-                    center=turn @ face.center + target_from_this.translation,
-                    normal_covariance=turn @ face.normal_covariance @ turn.T,
-                )
-                for face in self.faces
+        turn, shift = target_from_this
+        faces = (
+            dataclasses.replace(
+                face,
+                normal=turn @ face.normal,
+                center=turn @ face.center + shift,
+                normal_covariance=turn @ face.normal_covariance @ turn.T,
             )
+            for face in self.faces
         )
+        return Cube(tuple(faces))
 
 
 def fit_face(points: np.ndarray, *, noise_mm: float = 0.0, form_mm: float = 0.0) -> Face:
@@ -105,9 +97,8 @@ def fit_face(points: np.ndarray, *, noise_mm: float = 0.0, form_mm: float = 0.0)
 
     Args:
       points: at least 3, not on one line.
-      noise_mm: of each point, along the normal, at least; three points show none of their own.
-      form_mm: deviation of the surface from a plane. It does not average out over the points: it
-        counts as the same over a ninth of the face.
+      noise_mm: of each point along the normal, at least; three points show none of their own.
+      form_mm: deviation of the surface from a plane, the same over a ninth of the face.
 
     Raises:
       InputError: points that fix no plane.
@@ -168,11 +159,11 @@ def cube_of(
                 f"{most_askew_deg:g}: are their points on one face each, and is it a cube?"
             )
     outward = []
-    for k, face in enumerate(faces):
+    for face in faces:
         # the other faces lie below it: a cube is convex
         below = sum(face.height_mm(other.center[None])[0] for other in faces)
         normal = face.normal if below < 0 else -face.normal
-        outward.append(dataclasses.replace(faces[k], normal=normal))
+        outward.append(dataclasses.replace(face, normal=normal))
     if np.linalg.det(np.stack([face.normal for face in outward])) < 0:
         outward[1], outward[2] = outward[2], outward[1]
     return Cube(tuple(outward))

@@ -21,14 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
 from vanejax.files import write_json
-from vanejax.localization.pose_result import (
-    PointStatus,
-    PoseResult,
-    Status,
-    Uncertainty,
-    Verdict,
-    Verification,
-)
+from vanejax.localization.pose_result import PointStatus, PoseResult, Status, Verdict
 from vanejax.rigid import MATRIX_TOLERANCE, RigidTransform, rigid_from_matrix
 
 FORMAT = "vanejax pose"
@@ -121,7 +114,8 @@ def result_to_dict(
         }
         for other in result.alternatives
     ]
-    refinement = result.refinement
+    refinement, uncertainty, checks = result.refinement, result.uncertainty, result.verification
+    statuses = np.bincount(np.asarray(checks.status, np.int64), minlength=len(PointStatus))
     return _plain(
         {
             "format": FORMAT,
@@ -135,8 +129,29 @@ def result_to_dict(
             "weights": weights_name,
             "verdict": {"status": result.verdict.status, "reason": result.verdict.reason},
             **pose_to_dict(result.part_from_camera),
-            "uncertainty": _uncertainty(result.uncertainty),
-            "verification": _verification(result.verification),
+            "uncertainty": {
+                "meaning": _UNCERTAINTY,
+                "center_mm": uncertainty.center,
+                "rotation_sigma_deg": uncertainty.rotation_sigma_deg,
+                "translation_sigma_mm": uncertainty.translation_sigma_mm,
+                "weakest_rotation": {
+                    "axis": uncertainty.weakest_rotation_axis,
+                    "sigma_deg": uncertainty.weakest_rotation_sigma_deg,
+                },
+                "weakest_translation": {
+                    "axis": uncertainty.weakest_translation_axis,
+                    "sigma_mm": uncertainty.weakest_translation_sigma_mm,
+                },
+                "covariance": uncertainty.covariance,
+            },
+            "verification": {
+                "inlier_share": checks.inlier_share,
+                "violation_share": checks.violation_share,
+                "unmeasured_share": checks.unmeasured_share,
+                "tolerance_mm": checks.tolerance_mm,
+                "points_checked": len(checks.checked),
+                "points": {status.name.lower(): statuses[status] for status in PointStatus},
+            },
             "refinement": {
                 "method": refinement.method,
                 "converged": refinement.converged,
@@ -314,36 +329,6 @@ def _matrix(value: Any, where: str) -> np.ndarray:
         return np.array(rows, np.float64).reshape(4, 4)
     except OverflowError:
         raise InputError(f"{where}: the matrix holds a value that is not finite") from None
-
-
-def _uncertainty(uncertainty: Uncertainty) -> dict[str, Any]:
-    return {
-        "meaning": _UNCERTAINTY,
-        "center_mm": uncertainty.center,
-        "rotation_sigma_deg": uncertainty.rotation_sigma_deg,
-        "translation_sigma_mm": uncertainty.translation_sigma_mm,
-        "weakest_rotation": {
-            "axis": uncertainty.weakest_rotation_axis,
-            "sigma_deg": uncertainty.weakest_rotation_sigma_deg,
-        },
-        "weakest_translation": {
-            "axis": uncertainty.weakest_translation_axis,
-            "sigma_mm": uncertainty.weakest_translation_sigma_mm,
-        },
-        "covariance": uncertainty.covariance,
-    }
-
-
-def _verification(verification: Verification) -> dict[str, Any]:
-    counts = np.bincount(np.asarray(verification.status, np.int64), minlength=len(PointStatus))
-    return {
-        "inlier_share": verification.inlier_share,
-        "violation_share": verification.violation_share,
-        "unmeasured_share": verification.unmeasured_share,
-        "tolerance_mm": verification.tolerance_mm,
-        "points_checked": len(verification.checked),
-        "points": {status.name.lower(): counts[status] for status in PointStatus},
-    }
 
 
 def _version(name: str) -> str | None:

@@ -46,8 +46,7 @@ def in_machine(motion: RigidTransform, machine_from_camera: RigidTransform) -> R
 def displacement(motion: RigidTransform, point: np.ndarray) -> np.ndarray:
     """[3] mm: where the motion brings a point [3] of its frame, less where it was.
 
-    A registration's error of the angle counts for more the farther off the point is: compare
-    displacements at the part, not at the origin of a machine two metres away.
+    Compare displacements at the part: an error of the angle grows with the distance.
     """
     point = np.asarray(point, np.float64)
     return motion.rotation @ point + motion.translation - point
@@ -67,13 +66,10 @@ class Twist:
 
 
 def twist_about(rotation: np.ndarray, axis: np.ndarray) -> Twist:
-    """The turn of a rotation [3, 3] about an axis [3]: its swing-twist decomposition.
-
-    Of all turns about the axis this is the one nearest to the rotation.
+    """The turn of a rotation [3, 3] about an axis [3] nearest to it: swing-twist decomposition.
 
     Raises:
-      InputError: an axis that is no direction, or a rotation that swings by half a turn, which no
-        angle about the axis is nearer to than any other.
+      InputError: an axis that is no direction, or a rotation that swings by half a turn.
     """
     real, along, imaginary = _about(rotation, axis)
     length = float(np.hypot(real, along))
@@ -111,8 +107,7 @@ def _about(rotation: np.ndarray, axis: np.ndarray) -> tuple[float, float, np.nda
 def common_axis(rotations: np.ndarray) -> np.ndarray:
     """[3] unit: the axis that rotations [K, 3, 3] share best, of a rotary stage for example.
 
-    The principal direction of the quaternions' imaginary parts: their squared swing is least. Its
-    sign is that of most of the given turns, weighted by their size.
+    The principal direction of the quaternions' imaginary parts, with the sign of most turns.
 
     Raises:
       InputError: no rotation, or none that turns by more than rounding.
@@ -178,8 +173,8 @@ class MotionErrors:
 
     Attributes:
       center: [3] mm, machine frame: the part's centre after the motion.
-      of_before, of_after: [6, 6], of errors as `Uncertainty` has them, about the part's centre.
-        They are opposite: what both registrations have in common cancels, as seen from the part.
+      of_before, of_after: [6, 6], of errors as `Uncertainty` has them, about the part's centre;
+        opposite: what both registrations have in common cancels.
       of_calibration: [6, 6], of an error of machine_from_camera, applied after it.
     """
 
@@ -200,14 +195,11 @@ class MotionErrors:
     def common(
         self, before: np.ndarray, after: np.ndarray, calibration: np.ndarray | None = None
     ) -> np.ndarray:
-        """[6, K]: what K causes do to the motion that act on everything at once.
+        """[6, K]: the error of the motion by K causes that act on everything at once.
 
-        Args:
-          before, after: [6, K], what each does to the registrations.
-          calibration: [6, K], what it does to machine_from_camera; None for nothing.
-
-        ``common @ common.T`` is a covariance if the columns are for one standard deviation of
-        independent causes.
+        Each has a column in ``before`` and ``after`` (both [6, K], errors of the registrations) and
+        in ``calibration`` (of machine_from_camera; None for nothing). ``common @ common.T`` is a
+        covariance if the columns are for one standard deviation of independent causes.
         """
         total = self.of_before @ before + self.of_after @ after
         return total if calibration is None else total + self.of_calibration @ calibration

@@ -1,8 +1,7 @@
 """Tool paths: points to machine with the tool's axes, moved to where the part is, and checked.
 
-Points are in the part's frame or in the machine's, as `vanejax.machine.controllers` has them; the
-axis of the
-tool points away from the material, along the surface's outward normal. Host numpy, float64, mm.
+Points are in the part's frame or in the machine's, see `vanejax.machine.controllers`; the tool's
+axis points away from the material, along the outward normal. Host numpy, float64, mm.
 """
 
 from __future__ import annotations
@@ -97,15 +96,12 @@ def tool_path_deviation(
     *,
     tolerance_mm: float,
 ) -> PathDeviation:
-    """Signed distance of points from the surface of a part that stands in the machine.
-
-    The distance is that to the nearest point of the CAD surface, exactly (`NearestFace`); its sign
-    says on which side of the face there the point is.
+    """Signed distance of points from the CAD surface of a part that stands in the machine.
 
     Args:
       points_machine: [N, 3] mm, machine frame.
       surface: the part, or its surface where that was built before.
-      machine_from_part: where the part truly is.
+      machine_from_part: where the part is.
       tolerance_mm: what is near enough.
 
     Raises:
@@ -130,7 +126,7 @@ def tool_path_deviation(
 def raster_path(
     part: Part, *, towards: np.ndarray, spacing_mm: float, most_tilt_deg: float = 60.0
 ) -> ToolPath:
-    """Lines to and fro over what a tool reaches that comes straight from one side.
+    """Lines to and fro, in the part's frame, over what a tool reaches from one side.
 
     Parallel rays on a square grid; where each first meets the part is a point of the path, the
     outward normal there is its axis.
@@ -140,9 +136,6 @@ def raster_path(
       towards: [3], part frame, the way in which the tool advances, any length.
       spacing_mm: between lines, and between points in a line.
       most_tilt_deg: steeper faces are left out.
-
-    Returns:
-      The path in the part's frame.
 
     Raises:
       InputError: a direction or a spacing that makes no sense, or nothing is reached.
@@ -179,8 +172,7 @@ def raster_path(
 def read_tool_path(path: str | os.PathLike[str]) -> ToolPath:
     """A table of x, y, z in mm, and i, j, k of the tool's axis where it has them.
 
-    Args:
-      path: text; the columns by name in its first line, or in this order.
+    The columns are named in the first line of the text, or in this order.
 
     Raises:
       InputError: as `vanejax.scans.point_file.read_points`; or a value that is not finite, or an
