@@ -45,7 +45,7 @@ FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 
 def blocks(text: str, *languages: str) -> list[tuple[str, str]]:
     """(language, content) of the fenced blocks in these languages, in order."""
-    return [(found[2], found[3]) for found in FENCED.finditer(text) if found[2] in languages]
+    return [(block[2], block[3]) for block in FENCED.finditer(text) if block[2] in languages]
 
 
 def commands(text: str) -> Iterator[list[str]]:
@@ -114,9 +114,9 @@ def check_pip(rest: list[str]) -> None:
     names = [word for word in rest if not word.startswith("-") and word != "install"]
     assert rest[0] == "install"
     for name in names:
-        found = re.fullmatch(r"(?:\.|vanejax)(?:\[([\w,]+)\])?", name)
-        assert found, f"no package of this project: {name}"
-        assert set((found[1] or "").split(",")) - {""} <= set(EXTRAS), f"no such extra: {name}"
+        requirement = re.fullmatch(r"(?:\.|vanejax)(?:\[([\w,]+)\])?", name)
+        assert requirement, f"no package of this project: {name}"
+        assert set((requirement[1] or "").split(",")) - {""} <= set(EXTRAS), f"no such extra: {name}"
 
 
 def check_module(module: str, rest: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,8 +237,8 @@ def test_every_program_of_the_pages_is_run_by_reproduce_or_by_a_test() -> None:
 
 def test_shell_text_falls_into_its_commands() -> None:
     text = "a -x '.[b]' && b 1 \\\n  2  # words\n\n. c > d.log\ncat > e <<'END'\nf g\nEND\nh | i\n"
-    found = [["a", "-x", ".[b]"], ["b", "1", "2"], [".", "c"], ["cat"], ["h"], ["i"]]
-    assert list(commands(text)) == found
+    simple = [["a", "-x", ".[b]"], ["b", "1", "2"], [".", "c"], ["cat"], ["h"], ["i"]]
+    assert list(commands(text)) == simple
     assert list(inline_commands("`vanejax scan vane --out x`, `vanejax scan`, `vanejax`")) == [
         ["vanejax", "scan", "vane", "--out", "x"]
     ]
@@ -312,12 +312,12 @@ def test_the_modules_that_pages_name_are_there() -> None:
                 place = ROOT.joinpath(*parts[:length])
                 if place.is_dir() or place.with_suffix(".py").exists():
                     break
-            found = importlib.import_module(".".join(parts[:length]))
+            value = importlib.import_module(".".join(parts[:length]))
             for part in parts[length:]:
-                found = getattr(found, part, None) or getattr(found, "__annotations__", {}).get(
+                value = getattr(value, part, None) or getattr(value, "__annotations__", {}).get(
                     part
                 )
-            if found is None:
+            if value is None:
                 missing.append(f"{page.name}: {name}")
     assert missing == []
 
@@ -360,12 +360,12 @@ def test_the_quick_start_runs_as_written(tmp_path, monkeypatch, capsys) -> None:
                 if any(word in shlex.join(words) for word in LONG) or words[0] == ".":
                     continue
                 exit_code = main(words[1:])
-                said = capsys.readouterr().out
+                output = capsys.readouterr().out
                 if words[1] == "register":
-                    status = said.partition(":")[0].lower()
+                    status = output.partition(":")[0].lower()
                     assert exit_code == EXIT_CODES[status]
                     verdicts += 1
-                printed += said + "\n"
+                printed += output + "\n"
                 run += 1
             continue
         here = set(masked(printed))
@@ -394,7 +394,7 @@ def test_every_reason_of_the_verdict_has_its_line() -> None:
         CompetingHypothesis(-20.0, 180.0, 0.5, pose),
         CompetingHypothesis(1.0, 180.0, 0.5, pose),
     )
-    said = [
+    verdicts = [
         test_verdict.verdict(),
         test_verdict.verdict(competing=(close,)),
         test_verdict.verdict(competing=(better, close)),
@@ -406,7 +406,7 @@ def test_every_reason_of_the_verdict_has_its_line() -> None:
         *(test_verdict.verdict(**changes) for changes in test_verdict.REJECTED.values()),
     ]
     used = set()
-    for verdict in said:
+    for verdict in verdicts:
         rows = [
             row
             for row, pattern in reasons().items()
