@@ -116,7 +116,9 @@ def check_pip(rest: list[str]) -> None:
     for name in names:
         requirement = re.fullmatch(r"(?:\.|vanejax)(?:\[([\w,]+)\])?", name)
         assert requirement, f"no package of this project: {name}"
-        assert set((requirement[1] or "").split(",")) - {""} <= set(EXTRAS), f"no such extra: {name}"
+        assert set((requirement[1] or "").split(",")) - {""} <= set(EXTRAS), (
+            f"no such extra: {name}"
+        )
 
 
 def check_module(module: str, rest: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
