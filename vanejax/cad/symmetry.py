@@ -44,7 +44,7 @@ def dihedral(
     return np.concatenate([turns, turns @ rotation_about(flip, 180, point)])
 
 
-class _DenseSurface:
+class DenseSurface:
     """Distances to a part's surface by dense samples that stand for small discs.
 
     A sample counts as a disc of its normal with as much radius as samples are apart, so a part's
@@ -131,7 +131,7 @@ def near_symmetries(
     continuous_axis: Axis | None = None,
     largest_share: float = 0.02,
     more: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> np.ndarray:
     """Motions that nearly map the part to itself, found numerically.
 
     They are local minima of the mismatch. Of the motions that differ by an exact symmetry only
@@ -146,10 +146,10 @@ def near_symmetries(
       more: [K, 4, 4] further motions to try.
 
     Returns:
-      Motions [M, 4, 4] and their symmetric mean surface distances [M] in mm, ascending.
+      Motions [M, 4, 4], by ascending symmetric mean surface distance.
     """
-    surface, limit = _DenseSurface(part), largest_share * part.radius
-    found: list[tuple[float, np.ndarray]] = []
+    surface, limit = DenseSurface(part), largest_share * part.radius
+    near: list[tuple[float, np.ndarray]] = []
     tried: list[np.ndarray] = []
 
     def is_new(matrix: np.ndarray, known: list[np.ndarray], angle_deg: float) -> bool:
@@ -180,22 +180,22 @@ def near_symmetries(
         matrix = min(matrix, surface.polish(matrix), key=coarse)
         if coarse(matrix) > 1.5 * limit:
             continue
-        if not is_new(matrix, [np.eye(4), *(m for _, m in found)], 1.0):
+        if not is_new(matrix, [np.eye(4), *(m for _, m in near)], 1.0):
             continue
         # it may still be on its way to a better one
         matrix = min(matrix, surface.polish(matrix), key=coarse)
         distance = surface.mismatch_mm(matrix)
         if distance < limit:
-            found.append((distance, matrix))
+            near.append((distance, matrix))
     kept: list[tuple[float, np.ndarray]] = []
-    for distance, matrix in sorted(found, key=lambda pair: pair[0]):
+    for distance, matrix in sorted(near, key=lambda pair: pair[0]):
         if is_new(matrix, [np.eye(4), *(m for _, m in kept)], SAME_TURN_DEG):
             kept.append((distance, matrix))
-    return np.array([m for _, m in kept]).reshape(-1, 4, 4), np.array([d for d, _ in kept])
+    return np.array([m for _, m in kept]).reshape(-1, 4, 4)
 
 
 def pose_error(
-    found: RigidTransform,
+    part_from_camera: RigidTransform,
     truth: RigidTransform,
     symmetries: np.ndarray,
     *,
@@ -205,15 +205,14 @@ def pose_error(
 ) -> tuple[float, float]:
     """How far a pose is from the nearest of all right ones.
 
-    With E = found @ truth^-1, a motion of the part's frame, and a symmetry S, the error is
-    S^-1 E: its angle, and by how much it moves the part's centre. Of the symmetries that one
+    With E = part_from_camera @ truth^-1, a motion of the part's frame, and a symmetry S, the error
+    is S^-1 E: its angle, and by how much it moves the part's centre. Of the symmetries that one
     counts for which angle in radians times radius plus that distance is smallest. About a
     continuous axis u the turn that leaves the smallest angle is taken out first: of the quaternion
     (w, v) the twist 2 atan2(v.u, w).
 
     Args:
-      found: part_from_camera, mm.
-      truth: part_from_camera, mm.
+      part_from_camera, truth: the pose and a right one, mm.
       symmetries: [S, 4, 4] in the part's frame, identity included.
       center: [3] mm, the part's centre in its frame.
       radius_mm: the part's radius, to weigh angles against distances.
@@ -222,7 +221,7 @@ def pose_error(
     Returns:
       rotation_deg in [0, 180], translation_mm at the centre.
     """
-    error = (found @ truth.inverse()).as_matrix()
+    error = (part_from_camera @ truth.inverse()).as_matrix()
     rest = np.linalg.inv(symmetries) @ error
     if continuous_axis is not None:
         point, direction = continuous_axis

@@ -90,11 +90,11 @@ class Trial:
             }
         return row
 
-    def _errors(self, scan: Disturbed, found: RigidTransform) -> dict[str, float]:
-        error = pose_error(found, scan.part_from_camera, self.part.center)
+    def _errors(self, scan: Disturbed, pose: RigidTransform) -> dict[str, float]:
+        error = pose_error(pose, scan.part_from_camera, self.part.center)
         rotation_deg, translation_mm = magnitudes(error)
-        pose = {"rotation_deg": rotation_deg, "translation_mm": translation_mm}
-        return pose | self._fit(scan, found)
+        errors = {"rotation_deg": rotation_deg, "translation_mm": translation_mm}
+        return errors | self._fit(scan, pose)
 
     def _fit(self, scan: Disturbed, pose: RigidTransform) -> dict[str, float]:
         """RMSE and FFMDE (eqs 1, 2) of the thinned scan on the thinned surface of the part."""

@@ -50,7 +50,12 @@ class ChallengePart:
     also_tried: np.ndarray | None = None
 
     @functools.cached_property
-    def _near(self) -> tuple[np.ndarray, np.ndarray]:
+    def near_symmetries(self) -> np.ndarray:
+        """[M, 4, 4] f64: motions that nearly map the part to itself; see `near_symmetries`.
+
+        Up to exact symmetries: of `symmetries` times a near one, one is listed. Sought on first
+        use (0.5 to 5 s; the sphere 20 s).
+        """
         return near_symmetries(
             self.part,
             self.symmetries,
@@ -58,27 +63,15 @@ class ChallengePart:
             more=self.also_tried,
         )
 
-    @property
-    def near_symmetries(self) -> np.ndarray:
-        """[M, 4, 4] f64: motions that nearly map the part to itself; see `near_symmetries`.
-
-        Up to exact symmetries: of `symmetries` times a near one, one is listed. Sought on first
-        use (0.5 to 5 s; the sphere 20 s).
-        """
-        return self._near[0]
-
-    @property
-    def near_distances_mm(self) -> np.ndarray:
-        """[M] f64: symmetric mean surface distance of each near symmetry, ascending."""
-        return self._near[1]
-
-    def pose_error(self, found: RigidTransform, truth: RigidTransform) -> tuple[float, float]:
+    def pose_error(
+        self, part_from_camera: RigidTransform, truth: RigidTransform
+    ) -> tuple[float, float]:
         """Degrees and mm (at the part's centre) to the nearest right pose; both part_from_camera.
 
         See `vanejax.cad.symmetry.pose_error`.
         """
         return pose_error(
-            found,
+            part_from_camera,
             truth,
             self.symmetries,
             center=self.part.center,

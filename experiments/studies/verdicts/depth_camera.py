@@ -100,10 +100,10 @@ def measure(
             whole = _table(used, depth, covered, vertices, share, rng)
         else:
             whole = _clamp(used, depth, share, rng)
-        foreign = np.isfinite(whole) & (whole != depth)
-        rows, columns = np.nonzero(foreign)
+        clutter = np.isfinite(whole) & (whole != depth)
+        rows, columns = np.nonzero(clutter)
         x, y = used.camera.slopes(columns, rows)
-        points[foreign] = whole[foreign][:, None] * np.stack([x, y, np.full_like(x, -1.0)], -1)
+        points[clutter] = whole[clutter][:, None] * np.stack([x, y, np.full_like(x, -1.0)], -1)
         depth = whole
     points = points[np.isfinite(depth)]
     if not len(points):
@@ -160,7 +160,7 @@ def _table(
     foot = vertices[np.argmin(vertices @ normal)]
     plane = _plane_depth(sensor.camera, foot, normal)
     plane += sensor.range_sigma_mm(plane) * rng.standard_normal(plane.shape)
-    # nor beside it, where its points would hardly be foreign
+    # nor beside it, where its points would hardly be clutter
     plane[ndimage.binary_dilation(covered, iterations=2)] = np.nan
     rows, columns = np.nonzero(np.isfinite(plane))
     there = np.argwhere(np.isfinite(depth))

@@ -204,9 +204,9 @@ def picture(report: Mapping[str, Any]) -> Figure:
     curves, bars = figure.subplots(1, 2)
     lines = ("-", "--", "-.", ":", (0, (1, 3)))
     for color, line, name in zip(SERIES, lines, report["figures"], strict=False):
-        found = report["figures"][name]
-        label = f"{FIGURES[name]}: {found['auc']:.3f}"
-        false_accepts, true_accepts = found["curve"]
+        figure_row = report["figures"][name]
+        label = f"{FIGURES[name]}: {figure_row['auc']:.3f}"
+        false_accepts, true_accepts = figure_row["curve"]
         curves.plot(false_accepts, true_accepts, color=color, linestyle=line, label=label)
     curves.plot([0, 1], [0, 1], color=FAINT, linewidth=0.8)
     add_legend(

@@ -57,14 +57,14 @@ class PosedScan:
     points: np.ndarray
     truth: RigidTransform
 
-    def error(self, found: RigidTransform) -> tuple[float, float]:
+    def error(self, part_from_camera: RigidTransform) -> tuple[float, float]:
         """Degrees and mm to the nearest right pose."""
-        return self.challenge.pose_error(found, self.truth)
+        return self.challenge.pose_error(part_from_camera, self.truth)
 
-    def is_right(self, found: RigidTransform) -> bool:
+    def is_right(self, part_from_camera: RigidTransform) -> bool:
         """Whether a part_from_camera is as near as the sensor allows."""
         most_deg, most_mm = RIGHT.get(self.sensor, RIGHT_ELSE)
-        angle, shift = self.error(found)
+        angle, shift = self.error(part_from_camera)
         return angle < most_deg and shift < most_mm
 
 

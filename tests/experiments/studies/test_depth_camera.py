@@ -83,9 +83,9 @@ def test_the_depth_camera_errs_more_from_farther(box, scanner):
 def test_clutter_is_a_tenth_to_a_fifth_and_not_of_the_part(box, scanner, seed):
     pose = random_pose(np.random.default_rng([seed, 5]), box, 300.0)
     points = measure(box, scanner, pose, kind="clutter", seed=seed)
-    foreign = np.abs(distances_mm(box, pose, points)) > 0.4  # 8 times the noise
+    clutter = np.abs(distances_mm(box, pose, points)) > 0.4  # 8 times the noise
     # a table's strip along the edge on which the part lies is nearer than that
-    assert 0.07 < np.mean(foreign) < 0.21
+    assert 0.07 < np.mean(clutter) < 0.21
     assert np.linalg.norm(points - pose.apply(box.center[None]), axis=1).max() < 4 * box.radius
 
 
