@@ -11,6 +11,7 @@ from matplotlib.colors import to_rgb
 from vanejax.plotting import canvas
 from vanejax.plotting.deviation import STATUS_COLORS
 from vanejax.plotting.sensing import REASON_COLORS
+from vanejax.report.templates import source
 
 # of linear RGB, for complete dichromats (Machado, Oliveira, Fernandes, 2009)
 VISIONS = {
@@ -101,3 +102,11 @@ def test_series_differ_for_every_eye() -> None:
 
 def test_the_paper_is_not_ours() -> None:
     assert least_distance(canvas.OURS, canvas.PAPER) > 15
+
+
+def test_the_report_has_the_same_colours() -> None:
+    style = source("page.css")
+    names = {"scan": canvas.SCAN, "cad": canvas.CAD, "hidden": canvas.HIDDEN}
+    names |= {"lost": canvas.NO_PARTNER, "accepted": canvas.VERDICTS["accepted"]}
+    for name, color in names.items():
+        assert f"--{name}: {color};" in style

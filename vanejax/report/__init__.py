@@ -5,6 +5,6 @@ view (`write_report`), or the 3-D view alone for a notebook.
 """
 
 from vanejax.report.page import write_report
-from vanejax.report.view3d import View3d, motion_view, pose_view, scan_view
+from vanejax.report.view3d import View3d, pose_view, scan_view
 
-__all__ = ["View3d", "motion_view", "pose_view", "scan_view", "write_report"]
+__all__ = ["View3d", "pose_view", "scan_view", "write_report"]

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.colors import to_rgb
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
@@ -36,11 +36,9 @@ from vanejax.scans.measured_scan import MeasuredScan
 _HEIGHT_PX = 560
 # a reader who stands a little beside the camera sees some of its shadow
 _YAW_DEG, _PITCH_DEG = 28.0, 14.0
-_FRAMES_PER_STEP = 12
 # the viewer colours dots by deviation: here its two ends are the two colours
 _CODE_UM = 32_000
 _SCAN_AND_HIDDEN = np.repeat([(*to_rgb(c), 1.0) for c in (SCAN, HIDDEN)], 128, axis=0)
-_NOISE_LIFT = 0.01  # radii: noise of a network's scans, which would hide half of the dots
 _DOT, _LARGEST_DOT = 0.45, 0.012  # spacings, radii: between the dots the part's shading shows
 
 
@@ -91,20 +89,18 @@ class _Controls:
     Attributes:
       poses: names of the poses; a single one is no choice.
       legend: of the dots.
-      stops: indices of the poses at which a film halts; none where the poses are buttons.
       limit_mm: end of the colour bar; 0 where dots are not coloured by deviation.
       first: the pose shown at the start.
     """
 
     poses: Sequence[str]
     legend: Sequence[_Legend]
-    stops: Sequence[int] = ()
     limit_mm: float = 0.0
     first: int = 0
 
 
 def scan_view(scan: Scan, part: Part, *, voxel_mm: float = 1.5) -> View3d:
-    """What a view sees (green) and what self-occlusion hides from it (red), on the part.
+    """What a view sees and what self-occlusion hides from it, on the part.
 
     Args:
       scan: with `Scan.hidden`.
@@ -124,7 +120,7 @@ def scan_view(scan: Scan, part: Part, *, voxel_mm: float = 1.5) -> View3d:
         colors=_SCAN_AND_HIDDEN,
         reader_from_part=_beside(scan.camera_from_part.rotation), lift_mm=0.002 * part.radius,
     )  # fmt: skip
-    legend = [_Legend("scan", "seen"), _Legend("cad", "hidden by self-occlusion")]
+    legend = [_Legend("scan", "seen"), _Legend("hidden", "hidden by self-occlusion")]
     return _view(scene, _Controls(["scan"], [*legend, _Legend("metal", "CAD")]))
 
 
@@ -136,64 +132,6 @@ def pose_view(result: PoseResult, scan: MeasuredScan, part: Part) -> View3d:
     limit_mm = color_limit_mm(result.verification)
     controls = _Controls(shown.poses, legend, limit_mm=limit_mm, first=1)
     return _view(shown.json, controls)
-
-
-def motion_view(
-    points: np.ndarray,
-    poses: Sequence[RigidTransform],
-    names: Sequence[str],
-    part: Part,
-    *,
-    camera_from_part: RigidTransform,
-) -> View3d:
-    """A film of a cloud that moves onto the part, with a slider; it can be turned while it runs.
-
-    Between two poses the cloud turns about one axis, and its centre goes straight.
-
-    Args:
-      points: [N, 3] mm, source frame.
-      poses: part_from_source, mm, at least two: before, and after every iteration.
-      names: of the poses, one each.
-      part: what it moves onto.
-      camera_from_part: the reader looks from beside this camera; see `Viewpoints.view`.
-
-    Raises:
-      InputError: no points, fewer than two poses, another number of names, or a pose that is not
-        finite.
-    """
-    points = np.asarray(points, np.float64)
-    poses = [RigidTransform(*(np.asarray(value, np.float64) for value in pose)) for pose in poses]
-    if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
-        raise InputError(f"points have shape {points.shape}; they should be [N, 3], N at least 1")
-    if len(poses) < 2 or len(poses) != len(names):
-        raise InputError(
-            f"{len(poses)} poses with {len(names)} names; a film needs two or more, a name for each"
-        )
-    if not (np.isfinite(points).all() and all(np.isfinite(p.as_matrix()).all() for p in poses)):
-        raise InputError("a point or a pose is not finite: this registration failed")
-    film = _between(poses, points.mean(axis=0))
-    stops = range(0, len(film), _FRAMES_PER_STEP)
-    captions = [names[index // _FRAMES_PER_STEP] for index in range(len(film))]
-    scene = _scene(
-        part, points, film, codes_um=np.full(len(points), -_CODE_UM), colors=_SCAN_AND_HIDDEN,
-        reader_from_part=_beside(camera_from_part.rotation), lift_mm=_NOISE_LIFT * part.radius,
-    )  # fmt: skip
-    legend = [_Legend("scan", "scan"), _Legend("metal", "CAD")]
-    return _view(scene, _Controls(captions, legend, stops=list(stops)))
-
-
-def _between(poses: Sequence[RigidTransform], center: np.ndarray) -> list[RigidTransform]:
-    """A film from pose to pose: `_FRAMES_PER_STEP` frames from each to the next, and the last.
-
-    ``center`` [3] of the cloud, source frame, goes straight; a turn about a far origin would swing.
-    """
-    turns = Rotation.from_matrix(np.stack([pose.rotation for pose in poses]))
-    places = np.stack([pose.rotation @ center + pose.translation for pose in poses])
-    whole = np.arange(len(poses), dtype=np.float64)
-    times = np.arange((len(poses) - 1) * _FRAMES_PER_STEP + 1) / _FRAMES_PER_STEP
-    rotations = Slerp(whole, turns)(times).as_matrix()
-    path = np.stack([np.interp(times, whole, places[:, axis]) for axis in range(3)], axis=1)
-    return [RigidTransform(r, p - r @ center) for r, p in zip(rotations, path, strict=True)]
 
 
 def _beside(camera_from_part: np.ndarray) -> np.ndarray:
@@ -253,15 +191,13 @@ def _scene(
 def _view(scene: str, controls: _Controls) -> View3d:
     """The page around a scene."""
     environment = templates()
-    style, script, film = (source(name) for name in ("page.css", "viewer.js", "film.js"))
-    scripts = [script, film] if controls.stops else [script]
-    hashes = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts]
+    script = source("viewer.js")
     page = environment.get_template("view3d.html").render(
         scene=scene,
         controls=controls,
         color_bar=color_bar(),
-        style=style,
-        scripts=scripts,
-        policy=" ".join(f"'sha256-{value}'" for value in hashes),
+        style=source("page.css"),
+        script=script,
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
     return View3d(page)
