@@ -15,7 +15,7 @@ from vanejax.errors import InputError
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints, look_at
 from vanejax.scanner.exposure import Exposure
 from vanejax.scanner.measurement import Measurement, Reason, measure
-from vanejax.scanner.range_errors import Lens, Trueness, near_outline, window_mean
+from vanejax.scanner.range_errors import Trueness, near_outline, window_mean
 from vanejax.scanner.sensor import PRESETS, Sensor, preset
 from vanejax.scanner.virtual_scanner import Scanner
 
@@ -192,13 +192,6 @@ def test_steps_of_depth_and_of_disparity(plate):
     disparity = sensor.focal_baseline / -take(plate, sensor).points[:, 2].astype(np.float64) / 0.125
     np.testing.assert_allclose(disparity, np.round(disparity), atol=1e-3)
     assert len(np.unique(np.round(disparity))) > 5
-
-
-def test_a_focal_error_scales_across_the_axis_only(plate):
-    scan = take(plate, Sensor(camera=CAMERA, lens=Lens(focal_error=0.01)))
-    ideal = scan.ideal.points
-    np.testing.assert_allclose(scan.points[:, :2], 1.01 * ideal[:, :2], rtol=1e-5, atol=1e-4)
-    np.testing.assert_array_equal(scan.points[:, 2], ideal[:, 2])
 
 
 def test_trueness_biases_and_does_not_scatter(plate):

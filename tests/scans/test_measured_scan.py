@@ -151,15 +151,6 @@ def test_arrays_of_other_shapes_are_refused(points, message):
         clean_scan(points)
 
 
-def test_the_sensor_may_look_along_either_axis():
-    assert clean_scan(wavy(depth=400)).looks_along == "+z"
-    assert clean_scan(wavy(depth=-400)).looks_along == "-z"
-    sideways = clean_scan(wavy()[:, [2, 0, 1]])
-    assert np.array_equal(sideways.sensor_origin, np.zeros(3))
-    assert sideways.looks_along is None
-    assert clean_scan(wavy(), sensor_origin="unknown").looks_along is None
-
-
 def test_a_given_sensor_is_used_whatever_the_cloud_says():
     origin = np.array([1.0, 2.0, 900.0])
     scan = clean_scan(wavy(), sensor_origin=origin)

@@ -292,12 +292,6 @@ def test_text_without_names(tmp_path):
     assert found.notes == ()
 
 
-def test_padding_after_the_last_point_is_no_point(tmp_path):
-    for name, data in (("a.ply", PLY), ("a.pcd", PCD), ("a.ply", PLY_TEXT), ("a.pcd", PCD_TEXT)):
-        file = read_points(put(tmp_path, name, data + (b"\n" if b"ascii" in data else b"\0") * 99))
-        assert np.array_equal(file.points, read_points(put(tmp_path, name, data)).points)
-
-
 @pytest.mark.parametrize(
     "row", ["1,5;2,5;3,5", "1,5 2,5 3,5", "1,5\t-2,5\t3,5", "1,5,2,5,3,5", "-1,25,2,5,3,75"]
 )

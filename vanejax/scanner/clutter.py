@@ -1,8 +1,8 @@
 """What stands and lies around a part while it is scanned: table, clamps, chips, coolant drops.
 
-Everything is in the part's frame, in millimetres, with +z up: the part stands on the table with
-its lowest point, and the views of `hemisphere_viewpoints` look down on it. A scene is one surface
-for the scanner, so what stands before the part hides it, and what stands beside it is measured.
+All is in the part's frame, in mm, with +z up: the part stands on the table with its lowest point,
+and the views of `hemisphere_viewpoints` look down on it. A scene is one surface for the scanner, so
+what stands before the part hides it, and what stands beside it is measured.
 """
 
 from __future__ import annotations

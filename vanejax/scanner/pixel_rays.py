@@ -1,8 +1,7 @@
 """The rays of a camera's pixels at one pose: cast in float32, measured in float64.
 
-The ray of a pixel is (x, y, -1) in the camera frame, not made a unit vector: Embree does not mind,
-and the ray's parameter is then the depth. All of it is sums of a column's and a row's share, so
-that an image's rays cost one addition a coordinate.
+The ray of a pixel is (x, y, -1) in the camera frame, not a unit vector: its parameter is the depth,
+and it is the sum of a column's and a row's share, which costs one addition a coordinate.
 
 A plane is four numbers: its unit normal n, and d, mm, with ``n . p = d`` for its points p. "Local"
 is the part's frame moved to the part's centre.

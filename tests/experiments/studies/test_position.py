@@ -96,22 +96,6 @@ def test_the_stage_turns_the_part_about_its_axis():
     assert 0.05 < magnitudes(off)[0] < 5  # the drawing is a guess, and a good one
 
 
-def test_the_probe_sees_what_the_stage_does():
-    stand = build()
-    (start, *_), stages = stage_moves(12), stage_moves(12)
-    np.testing.assert_array_equal(start.translation, 0)
-    before = stand.probed(start, np.random.default_rng(1))
-    for stage in stages[1:]:
-        after = stand.probed(stage, np.random.default_rng(2))
-        way = np.mean(after - before, axis=0)
-        assert np.linalg.norm(way) == pytest.approx(np.linalg.norm(stage.translation), abs=0.05)
-        truth = in_machine(stand.moved(stage), stand.machine_from_camera).translation
-        assert np.linalg.norm(way - truth) < 0.06  # three deviations of its mean in 3-D
-    for count in (1, 13):
-        with pytest.raises(InputError, match="positions must be from 2 to 12"):
-            stage_moves(count)
-
-
 def test_the_cube_is_as_flat_and_square_as_it_says():
     block = GroundCube.ground(np.random.default_rng(3))
     surface = Surface(block.part)

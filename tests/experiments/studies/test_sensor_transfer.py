@@ -24,7 +24,6 @@ from vanejax.scanner.measurement import measure
 from vanejax.scanner.sensor import preset
 from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.scan_file import save_points
-from vanejax.training.online_scans import OnlineScans
 from vanejax.training.pretrained import pretrained_matcher
 
 
@@ -106,19 +105,6 @@ def test_two_trainings_differ_in_the_effects_alone(folder: Path) -> None:
     ideal.name, ideal.online = real.name, dataclasses.replace(ideal.online, effects=True)
     assert ideal == real
     assert real.online.resolution == 1.0  # its own pixels
-
-
-def test_no_effects_leave_the_camera_and_nothing_of_the_sensor() -> None:
-    settings = OnlineScans(sensor="consumer_depth", effects=False)
-    sensor, full = settings.make_sensor(), preset("consumer_depth")
-    assert sensor.camera == full.camera
-    part = guide_vane()
-    pose = hemisphere_viewpoints(part.center).view(3)
-    rng = np.random.default_rng(0)
-    measured = measure(Scanner(part), sensor, pose, rng)
-    ideal = Scanner(part).scan(full.camera, pose)
-    np.testing.assert_array_equal(measured.points, ideal.points)
-    assert OnlineScans(sensor="consumer_depth").make_sensor() == full
 
 
 def test_a_sensor_that_is_none_is_refused(folder: Path, capsys) -> None:
