@@ -1,4 +1,4 @@
-"""SE(3): group laws, exponential and logarithm, and the best motion between two point sets."""
+"""SE(3): group laws, the exponential, and the best motion between two point sets."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
 from vanejax.matching.procrustes import nearest_rotation, weighted_procrustes
-from vanejax.matching.se3 import exp_se3, exp_so3, hat, log_se3, log_so3, rotation_angle, vee
+from vanejax.matching.se3 import exp_se3, exp_so3, hat, rotation_angle
 from vanejax.rigid import RigidTransform
 
 BATCHES = [(), (1,), (3, 1, 2)]
 ROUNDING = 1e-12  # f64 eps x coordinates up to 100 x a dozen operations
 
-exp_se3, exp_so3, log_se3, log_so3 = map(jax.jit, (exp_se3, exp_so3, log_se3, log_so3))
+exp_se3, exp_so3 = map(jax.jit, (exp_se3, exp_so3))
 rotation_angle = jax.jit(rotation_angle)
 angle_gradient = jax.jit(jax.grad(lambda omega: rotation_angle(exp_so3(omega))))
 procrustes = jax.jit(weighted_procrustes)
@@ -75,9 +75,7 @@ def test_free_functions_take_any_batch(batch):
     rng = np.random.default_rng(0)
     twist = jnp.asarray(rng.normal(size=(*batch, 6)))
     motion = exp_se3(twist)
-    np.testing.assert_allclose(log_se3(motion), twist, atol=ROUNDING)
     np.testing.assert_allclose(exp_so3(twist[..., :3]), motion.rotation, atol=ROUNDING)
-    np.testing.assert_allclose(vee(hat(twist[..., :3])), twist[..., :3], atol=0)
     cross = np.cross(twist[..., :3], twist[..., 3:])
     product = np.einsum("...ij,...j->...i", hat(twist[..., :3]), twist[..., 3:])
     np.testing.assert_allclose(product, cross, atol=ROUNDING)
@@ -94,9 +92,9 @@ angles_up_to_pi = st.one_of(st.just(0.0), near_zero, st.floats(0.0, 3.14), near_
 directions = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-3)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(direction=directions, angle=angles_up_to_pi, seed=st.integers(0, 9))
-def test_exponential_and_logarithm(direction, angle, seed):
+def test_exponential_and_angle(direction, angle, seed):
     omega = angle * np.array(direction) / np.linalg.norm(direction)
     twist = np.concatenate([omega, np.random.default_rng(seed).normal(size=3)])
     with jax.enable_x64(True):
@@ -106,19 +104,6 @@ def test_exponential_and_logarithm(direction, angle, seed):
         # f64 eps x 1000 where the Taylor series end (0.01 rad), and expm's own rounding
         np.testing.assert_allclose(motion.as_matrix(), scipy.linalg.expm(generator), atol=1e-12)
         np.testing.assert_allclose(rotation_angle(motion.rotation), angle, atol=1e-12)
-        np.testing.assert_allclose(log_so3(motion.rotation), omega, atol=1e-12)
-        # beside pi the axis is good to eps, and so is the translation through it
-        np.testing.assert_allclose(log_se3(motion), twist, atol=1e-11)
-
-
-@pytest.mark.parametrize(
-    "axis", [(1, 0, 0), (0, -1, 0), (0, 0, 1), (0.6, 0, 0.8), (0.6, -0.48, 0.64)]
-)
-def test_logarithm_of_a_half_turn(axis):
-    half_turn = 2 * np.outer(axis, axis) - np.eye(3)
-    omega = np.asarray(log_so3(jnp.asarray(half_turn)))
-    np.testing.assert_allclose(np.linalg.norm(omega), np.pi, atol=ROUNDING)
-    np.testing.assert_allclose(exp_so3(omega), half_turn, atol=ROUNDING)  # either sign is right
 
 
 @pytest.mark.parametrize("angle", [1e-6, 1e-3, 9.9e-3, 1.01e-2, 0.03, 0.3, 3.0])
@@ -126,11 +111,9 @@ def test_single_precision_keeps_its_digits(angle):
     """Between Taylor and closed form too, where 1 - cos t would cancel."""
     twist = np.array([0.6 * angle, 0, -0.8 * angle, 1, 2, -3])
     exact = exp_se3(twist)
-    single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), exact)
     found = exp_se3(twist.astype(np.float32))
     assert found.rotation.dtype == jnp.float32
     assert_same(found, exact, atol=1e-6)  # f32 eps x 3 x 3 operations
-    np.testing.assert_allclose(log_se3(single), twist, atol=3e-6)
 
 
 @pytest.mark.parametrize("degrees", [1e-4, 1e-3, 0.02, 1.0, 179.99])
@@ -142,33 +125,11 @@ def test_rotation_angle_in_single_precision(degrees):
     np.testing.assert_allclose(np.degrees(float(found)), degrees, rtol=1e-5)  # f32 eps x 100
 
 
-def test_gradients_of_exponential_and_logarithm():
-    """Forward, reverse and central differences agree: at zero, beside both ends of the series."""
-
-    @jax.jit
-    @jax.vmap
-    def jacobians(twist):
-        base = exp_se3(twist)
-
-        def logarithm(step):  # along the group: its argument stays a rotation
-            return log_se3(base @ exp_se3(step))
-
-        def central(function, at, eps=1e-5):
-            steps = eps * jnp.eye(6)
-            ahead, back = (jax.vmap(lambda d, s=s: function(at + s * d))(steps) for s in (1, -1))
-            return jax.tree.map(lambda f, b: jnp.moveaxis((f - b) / (2 * eps), 0, -1), ahead, back)
-
-        return [
-            (jax.jacfwd(function)(at), jax.jacrev(function)(at), central(function, at))
-            for function, at in ((exp_se3, twist), (logarithm, jnp.zeros(6)))
-        ]
-
-    angles = np.array([0.0, 1e-9, 0.009, 0.011, 1.0, 3.1])
-    twists = angles[:, None] * [0.6, 0, -0.8, 0, 0, 0] + [0, 0, 0, 1, 2, -3]
-    for forward, reverse, numerical in jacobians(twists):
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), forward, reverse)
-        # eps^2 times a third derivative, which near pi is about 1e2
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-7), forward, numerical)
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.009, 0.011, 1.0, 3.1])
+def test_gradients_of_the_exponential(angle):
+    """At zero, and beside both ends of the series."""
+    twist = angle * np.array([0.6, 0, -0.8, 0, 0, 0]) + [0, 0, 0, 1, 2, -3]
+    check_grads(exp_se3, (twist,), order=1, modes=["fwd", "rev"], atol=1e-7, rtol=1e-7, eps=1e-5)
 
 
 @pytest.mark.parametrize("angle", [1e-9, 0.01, 1.0, 3.1])

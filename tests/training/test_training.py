@@ -11,9 +11,10 @@ import numpy as np
 import optax
 import pytest
 
+from vanejax.matching import fast_rpmnet
 from vanejax.matching.metrics import pose_metrics
 from vanejax.matching.rpmnet import Match
-from vanejax.matching.se3 import exp_se3, log_se3
+from vanejax.matching.se3 import exp_se3, rotation_angle
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.training import loss_terms as losses
@@ -38,17 +39,24 @@ class Twist(nn.Module):
     def features(self, target):
         return jnp.zeros((target.xyz.shape[0], 8))
 
-    def neighborhoods(self, source):
-        return jnp.zeros((source.xyz.shape[0], 2, 7))
-
     def match(self, source, near, target, target_features, pose):
         """The first answer is one twist, the next, which starts there, two, and so on."""
-        done = jnp.linalg.norm(log_se3(pose)) / jnp.linalg.norm(self.twist)
+        done = rotation_angle(pose.rotation) / jnp.linalg.norm(self.twist[:3])
         size = 1 + jax.lax.stop_gradient(jnp.round(done))
         return make_match(source, target, size * self.twist)
 
     def __call__(self, source, target, init, iterations):
-        return self.match(source, self.neighborhoods(source), target, None, init)
+        return self.match(source, None, target, None, init)
+
+
+@pytest.fixture(autouse=True)
+def _twist_stands_for_the_fast_form(monkeypatch):
+    def called(name):
+        return lambda model, variables, *args: model.apply(variables, *args, method=name)
+
+    for name in ("features", "match"):
+        monkeypatch.setattr(fast_rpmnet, name, called(name))
+    monkeypatch.setattr(fast_rpmnet, "neighborhoods", lambda model, source: source.xyz[:, None])
 
 
 def make_match(source: PointCloud, target: PointCloud, twist: jax.Array) -> Match:

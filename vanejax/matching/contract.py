@@ -57,6 +57,44 @@ def chain(coarse: Register, fine: Register) -> Register:
     return register
 
 
+def from_partners(
+    source: PointCloud,
+    target_from_source: RigidTransform,
+    squared: jax.Array,
+    weights: jax.Array,
+    *,
+    converged: jax.Array,
+    iterations: int | jax.Array,
+) -> Registration:
+    """The result of a method whose source points have partners, each with a weight.
+
+    Args:
+      source: [N] points.
+      target_from_source: the answer.
+      squared: [N] f32, squared distances from the moved points to their partners; of no meaning
+        where the weight is 0.
+      weights: [N] f32 or bool, 0 to 1; 0 at padding.
+      converged: [] bool.
+      iterations: done.
+    """
+    total = jnp.sum(weights).astype(squared.dtype)
+    squared = jnp.where(weights > 0, weights * squared, 0.0)
+    return Registration(
+        target_from_source=target_from_source,
+        converged=converged,
+        iterations=jnp.asarray(iterations, jnp.int32),
+        rmse=jnp.sqrt(jnp.sum(squared) / jnp.maximum(total, 1e-9)),
+        overlap=total / jnp.maximum(jnp.sum(source.mask), 1),
+    )
+
+
+def pose_where(
+    condition: jax.Array, pose: RigidTransform, otherwise: RigidTransform
+) -> RigidTransform:
+    """``pose`` where the condition [] holds."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), pose, otherwise)
+
+
 Iteration = TypeVar("Iteration", bound=Any)  # a flax dataclass with ``target_from_source``
 
 

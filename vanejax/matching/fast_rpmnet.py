@@ -17,7 +17,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from vanejax.matching.contract import Register, Registration, last_iteration
+from vanejax.matching.contract import Register, Registration, from_partners, last_iteration
 from vanejax.matching.features import point_pair_features
 from vanejax.matching.fused_layers import (
     DenseNormRelu,
@@ -134,17 +134,13 @@ def rpmnet(model: RpmNet, variables: Mapping[str, Any], *, iterations: int = 5) 
     ) -> Registration:
         del key  # nothing here is random
         match = last_match(model, variables, source, target, init, iterations=iterations)
-        residual = match.target_from_source.apply(source.xyz) - match.partners
-        overlap = jnp.sum(match.weights) / jnp.maximum(jnp.sum(source.mask), 1)
-        finite = jnp.all(jnp.isfinite(match.target_from_source.as_matrix()))
-        squared = jnp.sum(match.weights * jnp.sum(residual**2, -1))
-        return Registration(
-            target_from_source=match.target_from_source,
-            converged=finite & (overlap > 1e-3),
-            iterations=jnp.asarray(iterations, jnp.int32),
-            rmse=jnp.sqrt(squared / jnp.maximum(jnp.sum(match.weights), 1e-9)),
-            overlap=overlap,
+        pose, weights = match.target_from_source, match.weights
+        squared = jnp.sum((pose.apply(source.xyz) - match.partners) ** 2, -1)
+        finite = jnp.all(jnp.isfinite(pose.as_matrix()))
+        result = from_partners(
+            source, pose, squared, weights, converged=finite, iterations=iterations
         )
+        return result.replace(converged=finite & (result.overlap > 1e-3))
 
     return register
 

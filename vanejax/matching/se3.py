@@ -1,4 +1,4 @@
-"""The group SE(3) in JAX: exponential, logarithm, angles; any leading batch shape."""
+"""The group SE(3) in JAX: exponential and angle; any leading batch shape."""
 
 from __future__ import annotations
 
@@ -21,12 +21,6 @@ def hat(omega: jax.Array) -> jax.Array:
     zero = jnp.zeros_like(x)
     rows = [jnp.stack(r, -1) for r in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
     return jnp.stack(rows, -2)
-
-
-def vee(matrix: jax.Array) -> jax.Array:
-    """The vector [..., 3] of the skew part of a matrix: ``vee(hat(a)) == a``."""
-    skew = 0.5 * (matrix - jnp.swapaxes(matrix, -1, -2))
-    return jnp.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
 
 
 def _eye_like(matrices: jax.Array) -> jax.Array:
@@ -71,60 +65,15 @@ def exp_se3(twist: jax.Array) -> RigidTransform:
     )
 
 
-def log_so3(rotation: jax.Array) -> jax.Array:
-    """Axis-angle vector [..., 3] in radians, length at most pi.
-
-    Goes through the unit quaternion, taken from the row that is numerically largest (Shepperd,
-    1978): accurate over the whole range, at pi too, where the skew part of the matrix vanishes.
-    """
-    r = rotation
-    d0, d1, d2 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    s = [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]]
-    p = [r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]]
-    candidates = jnp.stack(
-        [
-            jnp.stack([1 + d0 + d1 + d2, s[0], s[1], s[2]], -1),
-            jnp.stack([s[0], 1 + d0 - d1 - d2, p[0], p[1]], -1),
-            jnp.stack([s[1], p[0], 1 - d0 + d1 - d2, p[2]], -1),
-            jnp.stack([s[2], p[1], p[2], 1 - d0 - d1 + d2], -1),
-        ],
-        -2,
-    )
-    squared = jnp.sum(candidates**2, -1)
-    best = jnp.argmax(squared, -1)[..., None, None]
-    row = jnp.broadcast_to(best, (*best.shape[:-1], 4))
-    q = jnp.take_along_axis(candidates, row, -2)[..., 0, :]
-    q = q / jnp.linalg.norm(q, axis=-1, keepdims=True)
-    q = jnp.where(q[..., :1] < 0, -q, q)
-    squared = jnp.sum(q[..., 1:] ** 2, -1)
-    # angle / sin(angle / 2): 2 at zero, sanitised before the root so that its gradient is finite
-    small = squared < 1e-12
-    sine = jnp.sqrt(jnp.where(small, 1.0, squared))
-    scale = jnp.where(small, 2.0, 2 * jnp.arctan2(sine, q[..., 0]) / sine)
-    return scale[..., None] * q[..., 1:]
-
-
-def log_se3(transform: RigidTransform) -> jax.Array:
-    """Twist [..., 6] = (rotation in radians, translation); inverse of `exp_se3` below pi."""
-    omega = log_so3(transform.rotation)
-    squared = jnp.sum(omega**2, -1)
-    a, b, _ = _exp_coefficients(squared)
-    k = hat(omega)
-    # (1 - a / 2b) / t^2, from the inverse of the left Jacobian; its Taylor series near zero
-    d = _series(squared, 1 / 12 + squared / 720, lambda t: (1 - 0.5 * a / b) / t**2)
-    inverse = _eye_like(k) - 0.5 * k + d[..., None, None] * matmul(k, k)
-    upsilon = matmul(inverse, transform.translation[..., None])[..., 0]
-    return jnp.concatenate([omega, upsilon], -1)
-
-
 def rotation_angle(rotation: jax.Array) -> jax.Array:
     """Geodesic angle [...] in radians, in [0, pi].
 
-    ``atan2(|vee(R - R^T)|, tr R - 1)``: the arc cosine of the trace reads exactly 0 for every
-    angle below 0.02 deg in float32, this form keeps full relative accuracy there.
+    ``atan2(|v|, tr R - 1)`` with v the vector of ``R - R^T``: the arc cosine of the trace reads
+    exactly 0 for every angle below 0.02 deg in float32, this form keeps full relative accuracy.
     """
-    skew = 2 * vee(rotation)
-    squared = jnp.sum(skew**2, -1)
+    r = rotation
+    skew = [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]]
+    squared = jnp.sum(jnp.stack(skew, -1) ** 2, -1)
     zero = squared == 0
     sine = jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
     return jnp.arctan2(sine, jnp.trace(rotation, axis1=-2, axis2=-1) - 1)

@@ -238,44 +238,6 @@ def test_moving_both_clouds_conjugates_the_answer(metric):
     assert moved.converged
 
 
-@pytest.mark.parametrize("metric", METRICS)
-def test_padding_and_order_change_nothing(metric):
-    source, target = pair()
-    source = source.replace(xyz=source.xyz + np.float32(0.01) * np.sin(40 * source.xyz))
-    rng = np.random.default_rng(0)
-
-    def scattered(points: PointCloud) -> PointCloud:
-        """Real points in another order, among rows that lie in the other points' way."""
-        real = points.mask
-        place = rng.permutation(ROWS)[: real.sum()]
-        mixed = cloud(points.xyz[real], points.normals[real], place=place)
-        noise = 0.5 * rng.normal(size=(2, ROWS, 3)).astype(np.float32)
-        xyz, normals = np.where(mixed.mask[:, None], (mixed.xyz, mixed.normals), noise)
-        return PointCloud(xyz, normals, mixed.mask)
-
-    run = register(metric=metric)
-    init = RigidTransform.identity()
-    plain = run(source, target, init, KEY)
-    mixed = run(scattered(source), scattered(target), init, KEY)
-    for a, b in zip(jax.tree.leaves(mixed), jax.tree.leaves(plain), strict=True):
-        np.testing.assert_allclose(a, b, atol=2e-5)  # at rest within 1e-3 deg
-    assert 1e-3 < plain.rmse < 0.02
-
-
-@pytest.mark.parametrize("metric", METRICS)
-def test_a_batch_is_the_loop(metric):
-    source, target = pair()
-    starts = [motion([0.1 * k, 0, 0], [0, 0, 0.04 * k]) for k in range(3)]
-    inits = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
-    run = icp(metric=metric, max_distance=0.3)
-    batch = jax.jit(jax.vmap(run, in_axes=(None, None, 0, None)))(source, target, inits, KEY)
-    assert len(set(batch.iterations.tolist())) > 1, "each stops where it comes to rest"
-    for index, start in enumerate(starts):
-        one = register(metric=metric)(source, target, start, KEY)
-        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(batch), strict=True):
-            np.testing.assert_allclose(a, b[index], atol=2e-6)  # f32 eps x 20
-
-
 # ---- edges ----
 
 

@@ -20,7 +20,13 @@ import jax.numpy as jnp
 from vanejax.errors import InputError
 from vanejax.matching.baselines.dgcnn import Dgcnn
 from vanejax.matching.baselines.transformer import Encoded, Transformer
-from vanejax.matching.contract import Register, Registration, last_iteration
+from vanejax.matching.contract import (
+    Register,
+    Registration,
+    from_partners,
+    last_iteration,
+    pose_where,
+)
 from vanejax.matching.procrustes import weighted_procrustes
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
@@ -31,12 +37,7 @@ _MASKED = -1e9
 
 @flax.struct.dataclass
 class Embedding:
-    """A cloud as far as it depends on no other.
-
-    Attributes:
-      features: [N, width] f32, of the `Dgcnn`.
-      encoded: of the transformer.
-    """
+    """A cloud as far as it depends on no other: features [N, width] f32 of `Dgcnn`, and encoded."""
 
     features: jax.Array
     encoded: Encoded
@@ -127,12 +128,7 @@ class Dcp(nn.Module, DcpSettings):
         )
 
     def __call__(
-        self,
-        source: PointCloud,
-        target: PointCloud,
-        init: RigidTransform,
-        iterations: int,
-        target_embedding: Embedding | None = None,
+        self, source: PointCloud, target: PointCloud, init: RigidTransform, iterations: int
     ) -> list[Match]:
         """All iterations from ``init``, the last one last, to look at; `last_match` is faster.
 
@@ -141,15 +137,12 @@ class Dcp(nn.Module, DcpSettings):
           target: [M] points, the reference.
           init: target_from_source to start from.
           iterations: static; 1 as published.
-          target_embedding: of `embed`, to share it between pairs.
         """
-        if target_embedding is None:
-            target_embedding = self.embed(target)
+        target_embedding = self.embed(target)
         matches: list[Match] = []
-        pose = init
         for _ in range(iterations):
+            pose = jax.lax.stop_gradient(matches[-1].target_from_source) if matches else init
             matches.append(self.match(source, target, target_embedding, pose))
-            pose = jax.lax.stop_gradient(matches[-1].target_from_source)
         return matches
 
 
@@ -163,14 +156,9 @@ def last_match(
     iterations: int,
     target_embedding: Embedding | None = None,
 ) -> Match:
-    """The last of several iterations; see `last_iteration`.
+    """The last of several iterations, at least 1, from ``init``; see `Dcp.match`.
 
     Args:
-      model, variables: the network and its weights.
-      source: [N] points.
-      target: [M] points, the reference.
-      init: target_from_source to start from.
-      iterations: static, at least 1.
       target_embedding: of `Dcp.embed`, where several pairs share it.
     """
     if target_embedding is None:
@@ -185,7 +173,6 @@ def last_match(
 def dcp(model: Dcp, variables: Mapping[str, Any], *, iterations: int = 1) -> Register:
     """A trained DCP as a `Register`: source and target in unit-sphere units.
 
-    More than the published one iteration feeds the moved source through the network again.
     ``init`` is the answer where a cloud is empty or the network's answer is not finite.
     """
 
@@ -194,25 +181,17 @@ def dcp(model: Dcp, variables: Mapping[str, Any], *, iterations: int = 1) -> Reg
     ) -> Registration:
         del key  # nothing here is random
         match = last_match(model, variables, source, target, init, iterations=iterations)
-        return _registration(source, target, init, match, iterations)
+        both = jnp.any(source.mask) & jnp.any(target.mask)
+        converged = both & jnp.all(jnp.isfinite(match.target_from_source.as_matrix()))
+        pose = pose_where(converged, match.target_from_source, init)
+        residual = jnp.where(converged, pose.apply(source.xyz) - match.partners, 0.0)
+        return from_partners(
+            source,
+            pose,
+            jnp.sum(residual**2, -1),
+            source.mask & both,
+            converged=converged,
+            iterations=iterations,
+        )
 
     return register
-
-
-def _registration(
-    source: PointCloud, target: PointCloud, init: RigidTransform, match: Match, iterations: int
-) -> Registration:
-    """The common result type from the last iteration."""
-    found = match.target_from_source
-    both = jnp.any(source.mask) & jnp.any(target.mask)
-    converged = both & jnp.all(jnp.isfinite(found.as_matrix()))
-    pose = jax.tree.map(lambda new, old: jnp.where(converged, new, old), found, init)
-    residual = jnp.where(converged, pose.apply(source.xyz) - match.partners, 0.0)
-    squared = jnp.sum(jnp.sum(residual**2, -1), where=source.mask)
-    return Registration(
-        target_from_source=pose,
-        converged=converged,
-        iterations=jnp.asarray(iterations, jnp.int32),
-        rmse=jnp.sqrt(squared / jnp.maximum(jnp.sum(source.mask), 1)),
-        overlap=both.astype(jnp.float32),
-    )

@@ -6,7 +6,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from vanejax.matching.features import fpfh
+from vanejax.matching.baselines.fpfh import fpfh
 from vanejax.pointcloud import PointCloud
 
 _EXACT = jax.lax.Precision.HIGHEST
@@ -44,16 +44,11 @@ class Triangles:
 def feature_distances(
     source: jax.Array, target: jax.Array, source_mask: jax.Array, target_mask: jax.Array
 ) -> jax.Array:
-    """[N, M] f32 squared Hellinger distances, up to a factor, between histograms.
+    """``sum (sqrt(a) - sqrt(b))^2`` [N, M] f32 of histograms [N, C] and [M, C], not negative.
 
-    ``sum (sqrt(a) - sqrt(b))^2``: on noisy clouds half as many again of the nearest features are
-    right as with ``sum (a - b)^2``, in which the few full bins drown the others (RootSIFT:
-    Arandjelovic and Zisserman, 2012).
-
-    Args:
-      source: [N, C] f32, not negative.
-      target: [M, C] f32, not negative.
-      source_mask, target_mask: [N], [M] bool; padding is far from everything.
+    Squared Hellinger distances, up to a factor: on noisy clouds half as many again of the nearest
+    features are right as with ``sum (a - b)^2``, in which the few full bins drown the others
+    (RootSIFT: Arandjelovic and Zisserman, 2012). Padding is far from everything.
     """
     a, b = jnp.sqrt(jnp.maximum(source, 0.0)), jnp.sqrt(jnp.maximum(target, 0.0))
     squared = jnp.sum(a**2, -1)[:, None] + jnp.sum(b**2, -1)[None, :]

@@ -10,7 +10,7 @@ from vanejax.matching.baselines.feature_matches import (
     fpfh_distances,
     nearest_matches,
 )
-from vanejax.matching.contract import Register, Registration
+from vanejax.matching.contract import Register, Registration, pose_where
 from vanejax.matching.procrustes import weighted_procrustes
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
@@ -96,7 +96,7 @@ def fgr(
 
         inside = (votes > 0) & (squared_residuals(pose) <= max_distance**2)
         converged = (jnp.sum(inside) >= 3) & jnp.all(jnp.isfinite(pose.as_matrix()))
-        pose = jax.tree.map(lambda a, b: jnp.where(converged, a, b), pose, init)
+        pose = pose_where(converged, pose, init)
         inside = (votes > 0) & (squared_residuals(pose) <= max_distance**2)
         mean = jnp.sum(squared_residuals(pose), where=inside) / jnp.maximum(jnp.sum(inside), 1)
         # several matches of one point count once

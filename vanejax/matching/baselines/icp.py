@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from vanejax.errors import InputError
-from vanejax.matching.contract import Register, Registration
+from vanejax.matching.contract import Register, Registration, from_partners, pose_where
 from vanejax.matching.procrustes import weighted_procrustes
 from vanejax.matching.se3 import exp_se3, rotation_angle
 from vanejax.pointcloud import PointCloud, nearest_neighbors
@@ -154,7 +154,7 @@ def icp(
             else:
                 new = weighted_procrustes(source.xyz, pairs.partners, weights)
             lost = ~enough(weights)
-            new = jax.tree.map(lambda a, b: jnp.where(lost, a, b), old, new)
+            new = pose_where(lost, old, new)
             turn = jnp.rad2deg(rotation_angle((new @ old.inverse()).rotation))
             shift = jnp.sum((new.apply(centre[None]) - old.apply(centre[None])) ** 2)
             return _Search(
@@ -175,14 +175,13 @@ def icp(
         pairs = pair(found.target_from_source)
         weights = weigh(pairs)
         held = _held_to_planes(pairs, weights) if to_plane else _held_to_points(pairs, weights)
-        kept = jnp.sum(pairs.kept)
-        mean = jnp.sum(pairs.squared, where=pairs.kept) / jnp.maximum(kept, 1)
-        return Registration(
-            target_from_source=found.target_from_source,
+        return from_partners(
+            source,
+            found.target_from_source,
+            pairs.squared,
+            pairs.kept,
             converged=found.at_rest & ~found.lost & enough(weights) & held,
             iterations=found.iterations,
-            rmse=jnp.sqrt(mean),
-            overlap=kept / jnp.maximum(count, 1),
         )
 
     return register

@@ -15,7 +15,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from vanejax.matching.contract import Registration
+from vanejax.matching.contract import Registration, from_partners, pose_where
 from vanejax.matching.fused_layers import cloud_max, product
 from vanejax.pointcloud import PointCloud, squared_distances
 from vanejax.rigid import RigidTransform
@@ -96,17 +96,15 @@ def registration_from_pose(
     """
     finite = jnp.all(jnp.isfinite(target_from_source.as_matrix()))
     known = finite & jnp.any(source.mask) & jnp.any(target.mask)
-    pose = jax.tree.map(
-        lambda found, start: jnp.where(known, found, start), target_from_source, init
-    )
+    pose = pose_where(known, target_from_source, init)
     squared = squared_distances(pose.apply(source.xyz), target.xyz)
     nearest = jnp.min(squared, axis=1, where=target.mask[None, :], initial=jnp.inf)
     partnered = source.mask & (nearest <= partner_distance**2)
-    count = jnp.sum(partnered)
-    return Registration(
-        target_from_source=pose,
-        converged=known & settled & (count > 0),
-        iterations=jnp.asarray(iterations, jnp.int32),
-        rmse=jnp.sqrt(jnp.sum(nearest, where=partnered) / jnp.maximum(count, 1)),
-        overlap=count / jnp.maximum(jnp.sum(source.mask), 1),
+    return from_partners(
+        source,
+        pose,
+        nearest,
+        partnered,
+        converged=known & settled & jnp.any(partnered),
+        iterations=iterations,
     )

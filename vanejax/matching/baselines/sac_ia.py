@@ -15,7 +15,7 @@ from vanejax.matching.baselines.feature_matches import (
     fpfh_distances,
     nearest_matches,
 )
-from vanejax.matching.contract import Register, Registration
+from vanejax.matching.contract import Register, Registration, from_partners, pose_where
 from vanejax.matching.procrustes import weighted_procrustes
 from vanejax.matching.se3 import exp_so3, hat
 from vanejax.pointcloud import PointCloud
@@ -106,20 +106,15 @@ def sac_ia(
         score = jnp.where(found & finite, jnp.sum(closeness, -1), -1.0)
         winner = jnp.argmax(score)
         converged = (score[winner] > 0) & (jnp.sum(closeness[winner] > 0) >= 3)
-        pose = jax.tree.map(
-            lambda leaf, start: jnp.where(converged, leaf[winner], start), poses, init
-        )
+        pose = pose_where(converged, jax.tree.map(lambda leaf: leaf[winner], poses), init)
         moved = source.transform(pose)
-        paired = _closeness(pose, source, surface) > 0
-        squared = jnp.sum((moved.xyz - target.xyz[_nearest(moved, surface)]) ** 2, -1)
-        count = jnp.sum(paired)
-        mean = jnp.sum(squared, where=paired) / jnp.maximum(count, 1)
-        return Registration(
-            target_from_source=pose,
+        return from_partners(
+            source,
+            pose,
+            jnp.sum((moved.xyz - target.xyz[_nearest(moved, surface)]) ** 2, -1),
+            _closeness(pose, source, surface) > 0,
             converged=converged,
-            iterations=jnp.asarray(refinements, jnp.int32),
-            rmse=jnp.sqrt(mean),
-            overlap=count / jnp.maximum(jnp.sum(source.mask), 1),
+            iterations=refinements,
         )
 
     return register
@@ -127,11 +122,10 @@ def sac_ia(
 
 @flax.struct.dataclass
 class _Surface:
-    """The target, made ready for many searches of the nearest point and normal.
+    """The target, made ready for many searches of the nearest point.
 
     Nearest in position and normal at once, ``|p - q|^2 + d^2 |n_p - n_q|^2`` with d the largest
-    distance of a partner: normals 60 deg apart weigh as much as points that lie d apart, so that
-    the two sides of a thin wall stay apart.
+    distance of a partner, so that the two sides of a thin wall stay apart.
 
     Attributes:
       cloud: [M] the target.

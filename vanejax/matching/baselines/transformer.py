@@ -1,9 +1,8 @@
 """A transformer of one encoder and one decoder block between two point clouds, as in DCP.
 
 The published network is the "Annotated Transformer": every sublayer is ``x + f(norm(x))``, encoder
-and decoder end in a norm of their own, nothing tells positions apart, and there is no dropout. The
-one network serves both directions, so all that depends on one cloud alone is a value of its own,
-`Encoded`: it is computed once per cloud, and once for a reference that many scans share.
+and decoder end in a norm of their own, without positions or dropout. What depends on one cloud
+alone, `Encoded`, is computed once per cloud: it serves both directions and many scans of a part.
 """
 
 from __future__ import annotations
@@ -23,9 +22,7 @@ class Encoded:
 
     Attributes:
       state: [N, width] f32, in the decoder, before it has looked at the other cloud.
-      queries: [N, H, D] f32, what it asks the other cloud.
-      keys: [N, H, D] f32, by which the other cloud finds its points.
-      values: [N, H, D] f32, what the other cloud then reads.
+      queries, keys, values: [N, H, D] f32; the queries are asked of the other cloud.
     """
 
     state: jax.Array
@@ -35,16 +32,12 @@ class Encoded:
 
 
 def attention(queries: jax.Array, keys: jax.Array, values: jax.Array, mask: jax.Array) -> jax.Array:
-    """``softmax(q k^T / sqrt(D)) v`` for each head (Vaswani et al., 2017, eq. 1).
+    """``softmax(q k^T / sqrt(D)) v`` for each head (Vaswani et al., 2017, eq. 1): [N, H, D] f32.
 
     Args:
       queries: [N, H, D] f32.
-      keys: [M, H, D] f32.
-      values: [M, H, D] f32.
+      keys, values: [M, H, D] f32.
       mask: [M] bool; padding gets no weight. With nothing real the answer is a finite mean.
-
-    Returns:
-      [N, H, D] f32.
     """
     scores = jnp.einsum("nhd,mhd->hnm", queries * queries.shape[-1] ** -0.5, keys)
     scores = jnp.where(mask[None, None, :], scores, _MASKED)
@@ -72,12 +65,7 @@ class LayerNorm(nn.Module):
 
 
 class MultiHeadAttention(nn.Module):
-    """Attention between projections of points; the projections are methods, to be shared.
-
-    Attributes:
-      width: channels of a point, in and out.
-      heads: H, divides ``width``.
-    """
+    """Attention of points [N, width] to points [M, width]; what both project to can be shared."""
 
     width: int
     heads: int
@@ -89,16 +77,14 @@ class MultiHeadAttention(nn.Module):
         self.value = nn.Dense(self.width)
         self.out = nn.Dense(self.width)
 
-    def _split(self, x: jax.Array) -> jax.Array:
-        return x.reshape(len(x), self.heads, -1)
+    def queries(self, x: jax.Array) -> jax.Array:
+        """[N, H, D] of points x [N, width]."""
+        return self.query(x).reshape(len(x), self.heads, -1)
 
-    def asks(self, x: jax.Array) -> jax.Array:
-        """Queries [N, H, D] of points x [N, width]."""
-        return self._split(self.query(x))
-
-    def offers(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Keys and values [M, H, D] of points x [M, width]."""
-        return self._split(self.key(x)), self._split(self.value(x))
+    def keys_and_values(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """[M, H, D] each, of points x [M, width]."""
+        shape = len(x), self.heads, -1
+        return self.key(x).reshape(shape), self.value(x).reshape(shape)
 
     def __call__(
         self, queries: jax.Array, keys: jax.Array, values: jax.Array, mask: jax.Array
@@ -108,7 +94,7 @@ class MultiHeadAttention(nn.Module):
 
     def within(self, x: jax.Array, mask: jax.Array) -> jax.Array:
         """Self-attention of points x [N, width] with mask [N]: [N, width]."""
-        return self(self.asks(x), *self.offers(x), mask)
+        return self(self.queries(x), *self.keys_and_values(x), mask)
 
 
 class FeedForward(nn.Module):
@@ -123,13 +109,7 @@ class FeedForward(nn.Module):
 
 
 class Transformer(nn.Module):
-    """Makes the features of one cloud depend on those of another.
-
-    Attributes:
-      width: channels of a feature.
-      heads: H, divides ``width``.
-      hidden: channels inside a feed-forward layer.
-    """
+    """Makes the features of one cloud depend on those of another; see `DcpSettings`."""
 
     width: int = 512
     heads: int = 4
@@ -146,17 +126,16 @@ class Transformer(nn.Module):
         self.decoder_norms = [LayerNorm() for _ in range(4)]
 
     def encode(self, x: jax.Array, mask: jax.Array) -> Encoded:
-        """A cloud by itself, from features x [N, width] and mask [N] bool.
+        """The encoder, and the decoder up to where it looks at the other cloud.
 
-        All of the encoder, the keys and values that the decoder takes from it, and the decoder up
-        to where it looks at the other cloud.
+        From features x [N, width] and mask [N] bool.
         """
         first, second, third = self.encoder_norms
         memory = x + self.encoder_attention.within(first(x), mask)
         memory = third(memory + self.encoder_feed_forward(second(memory)))
-        keys, values = self.cross_attention.offers(memory)
+        keys, values = self.cross_attention.keys_and_values(memory)
         state = x + self.decoder_attention.within(self.decoder_norms[0](x), mask)
-        queries = self.cross_attention.asks(self.decoder_norms[1](state))
+        queries = self.cross_attention.queries(self.decoder_norms[1](state))
         return Encoded(state=state, queries=queries, keys=keys, values=values)
 
     def decode(self, encoded: Encoded, other: Encoded, other_mask: jax.Array) -> jax.Array:

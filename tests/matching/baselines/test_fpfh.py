@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vanejax.matching.features import fpfh
+from vanejax.matching.baselines.fpfh import fpfh
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 
-PARITY = Path(__file__).parents[3] / "shared" / "parity" / "open3d.npz"
+PARITY = Path(__file__).parents[4] / "shared" / "parity" / "open3d.npz"
 N, RADIUS = 75, 0.45  # three blocks of rows, the last one not full
 
 histograms = jax.jit(functools.partial(fpfh, radius=RADIUS))
