@@ -38,7 +38,8 @@ HOST_WINGS = ["cad", "scanner", "scans", "localization", "machine"]
 JAX_IN_HOST_WINGS = {"scans.normals", "localization.matched_poses"}
 # what several baselines are made of
 SHARED = {
-    f"matching.baselines.{name}" for name in ("feature_matches", "pointnet", "dgcnn", "transformer")
+    f"matching.baselines.{name}"
+    for name in ("feature_matches", "fpfh", "pointnet", "dgcnn", "transformer")
 }
 
 
