@@ -208,8 +208,8 @@ def errors_under(
 ) -> dict[str, Any]:
     """Summaries of the errors over the test views."""
     report = report_of(config, scans, registered(config, scans, variables, progress=progress))
-    told = {name: report[name] for name in ("views", "non_finite_views")}
-    return told | {name: report["summary"][name] for name in MEASURES}
+    counts = {name: report[name] for name in ("views", "non_finite_views")}
+    return counts | {name: report["summary"][name] for name in MEASURES}
 
 
 def read_cells(workdir: Path) -> list[dict[str, Any]]:
@@ -245,8 +245,8 @@ def list_cells(cells: Sequence[Cell], config: Experiment, workdir: Path) -> None
     for cell in cells:
         settings = cell.config(config).training
         most = f", {settings.budget_minutes:g} min at most" if settings.budget_minutes else ""
-        told = "finished" if cell.name in names else f"{settings.steps} steps{most}"
-        print(f"{cell.name}: {told}")
+        status = "finished" if cell.name in names else f"{settings.steps} steps{most}"
+        print(f"{cell.name}: {status}")
 
 
 if __name__ == "__main__":

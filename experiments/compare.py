@@ -106,7 +106,7 @@ def compare(
                 "title": TITLES[name],
                 "paper": dataclasses.asdict(TABLE_1[name]) if name in TABLE_1 else None,
                 "settings": settings_of(name, config),
-                "training": training_told(networks.get(name)),
+                "training": training_summary(networks.get(name)),
                 "alone": figures(results, test),
                 "refined": figures(fine_step(results), test),
             }
@@ -122,16 +122,16 @@ def compare(
 
 def figures(results: Results, scans: ScanSet) -> dict[str, Any]:
     """Summaries over all views and the hardest, the success rate, and every view's pose error."""
-    found = summarize(results, scans)
+    measures = summarize(results, scans)
     rotation, translation = results.errors.rotation_deg, results.errors.translation_mm
     return {
         "success": np.mean(within_need(rotation, translation)),
-        "non_finite_views": found["non_finite_views"],
-        "summary": found["summary"],
-        "hardest": found["hardest"]["summary"],
-        "mre_per_axis_deg": found["mre_per_axis_deg"],
-        "mte_per_axis_mm": found["mte_per_axis_mm"],
-        "at_true_pose": found["at_true_pose"],
+        "non_finite_views": measures["non_finite_views"],
+        "summary": measures["summary"],
+        "hardest": measures["hardest"]["summary"],
+        "mre_per_axis_deg": measures["mre_per_axis_deg"],
+        "mte_per_axis_mm": measures["mte_per_axis_mm"],
+        "at_true_pose": measures["at_true_pose"],
         "converged": np.mean(results.registration.converged),
         "turned_over": np.mean(~(rotation < 90)),
         "overlap": summary(results.registration.overlap),
@@ -140,20 +140,20 @@ def figures(results: Results, scans: ScanSet) -> dict[str, Any]:
     }
 
 
-def training_told(network: Trained | None) -> dict[str, Any] | None:
+def training_summary(network: Trained | None) -> dict[str, Any] | None:
     """How a network was trained, without its curve; None where there is none."""
     if network is None or network.record is None:
         return None
-    told = network.record.summary(network.config.training.steps)
+    training = network.record.summary(network.config.training.steps)
     model = network.config.make_network().model
     leaves = jax.tree.leaves(network.variables)
     return {
-        "steps": told["steps"],
-        "wanted_steps": told["wanted_steps"],
-        "ended_by": told["ended_by"],
-        "hours": told["hours"],
-        "fall_in_last_quarter": told["fall_in_last_quarter"],
-        "flat": told["flat"],
+        "steps": training["steps"],
+        "wanted_steps": training["wanted_steps"],
+        "ended_by": training["ended_by"],
+        "hours": training["hours"],
+        "fall_in_last_quarter": training["fall_in_last_quarter"],
+        "flat": training["flat"],
         "parameters": sum(leaf.size for leaf in leaves),
         "model": type(model).__name__,
     }

@@ -157,15 +157,15 @@ def tune(
 def table(report: Mapping[str, Any]) -> str:
     """The best settings of each method, as options of the comparison."""
     lines = [f"{len(report['training_views'])} training views; {report['score']}"]
-    for name, found in report["methods"].items():
-        if "skipped" in found:
-            lines.append(f"{TITLES[name]}: {found['skipped']}")
+    for name, outcome in report["methods"].items():
+        if "skipped" in outcome:
+            lines.append(f"{TITLES[name]}: {outcome['skipped']}")
             continue
-        best = found["best"]
+        best = outcome["best"]
         lines += [
             f"{TITLES[name]}: {best['score_deg']:.3g} deg, median "
             f"{best['median_rotation_deg']:.3g} deg and {best['median_translation_mm']:.3g} mm, "
-            f"{best['time_s']:.2g} s; best of {len(found['cells'])}",
+            f"{best['time_s']:.2g} s; best of {len(outcome['cells'])}",
             "  " + " ".join(f"--config.{path}={value}" for path, value in best["values"].items()),
         ]
     return "\n".join(lines)

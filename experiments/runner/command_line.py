@@ -102,14 +102,14 @@ def resolve_config(argv: list[str]) -> list[str]:
             if index + 1 == len(argv):
                 raise InputError("--config needs a file, such as --config vane.py")
             value = argv[index + 1]
-        found = next((p for p in (Path(value), CONFIG_FOLDER / value) if p.is_file()), None)
-        if found is None:
+        path = next((p for p in (Path(value), CONFIG_FOLDER / value) if p.is_file()), None)
+        if path is None:
             there = ", ".join(sorted(p.name for p in CONFIG_FOLDER.glob("[!_]*.py")))
             raise InputError(f"no config {value!r} here or in experiments/configs/: {there}")
         if equals:
-            argv[index] = f"{name}={found}"
+            argv[index] = f"{name}={path}"
         else:
-            argv[index + 1] = str(found)
+            argv[index + 1] = str(path)
     return argv
 
 

@@ -25,7 +25,7 @@ PEERS = ("open3d", "small_gicp", "torch")
 def report_head(part: Part | None, *, seed: int, config: Any) -> dict[str, Any]:
     """What was run, when, on what, from which source: the first entries of a report's JSON."""
     return {
-        "date": now(),
+        "date": timestamp(),
         "machine": {
             "cpu": cpu_model(),
             "processor": platform.machine(),
@@ -41,7 +41,7 @@ def report_head(part: Part | None, *, seed: int, config: Any) -> dict[str, Any]:
     }
 
 
-def now() -> str:
+def timestamp() -> str:
     """Date and time to the second, UTC, in ISO 8601."""
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 

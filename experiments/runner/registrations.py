@@ -72,10 +72,10 @@ def register_views(
         if view == 0:  # compiles
             jax.block_until_ready(register(pair.source, pair.target, init, register_key))
         start = time.perf_counter()
-        found = jax.block_until_ready(register(pair.source, pair.target, init, register_key))
+        estimate = jax.block_until_ready(register(pair.source, pair.target, init, register_key))
         seconds = time.perf_counter() - start
-        measured = measure(pair, found.target_from_source, unit_mm)
-        rows.append(jax.device_get(Results(pair, found, *measured, time_s=np.float64(seconds))))
+        measured = measure(pair, estimate.target_from_source, unit_mm)
+        rows.append(jax.device_get(Results(pair, estimate, *measured, time_s=np.float64(seconds))))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
 
@@ -96,9 +96,9 @@ def _fit(pair: Pair, pose: RigidTransform, unit_mm: float) -> SurfaceFit:
 
 
 def measure(
-    pair: Pair, found: RigidTransform, unit_mm: float
+    pair: Pair, estimate: RigidTransform, unit_mm: float
 ) -> tuple[PoseErrors, SurfaceFit, SurfaceFit]:
     """Errors of a pose of one pair, and how the clouds fit under it and under the true pose."""
     truth = pair.target_from_source
-    fits = (_fit(pair, pose, unit_mm) for pose in (found, truth))
-    return pose_errors(found, truth, unit_mm=unit_mm), *fits
+    fits = (_fit(pair, pose, unit_mm) for pose in (estimate, truth))
+    return pose_errors(estimate, truth, unit_mm=unit_mm), *fits

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.runner.experiment import Experiment
-from experiments.runner.machine import git_commit, now, versions
+from experiments.runner.machine import git_commit, timestamp, versions
 from experiments.runner.training_record import TrainingRecord
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
@@ -86,7 +86,7 @@ class RunFolder:
             "versions": versions(),
             "python": platform.python_version(),
             "commit": git_commit(),
-            "started": now(),
+            "started": timestamp(),
         }
         write_json(record, mine | environment)
 

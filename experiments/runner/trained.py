@@ -15,6 +15,7 @@ from experiments.train import fit
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.matching.torch_weights import load_state_dict, rpmnet_variables
+from vanejax.settings import values_of
 from vanejax.training.dataset import ScanSet
 from vanejax.training.train_step import Variables
 
@@ -60,26 +61,19 @@ def trained(
             raise InputError(f"{given}: weights from PyTorch are read for an RPM-Net only")
         return Trained(rpmnet_variables(load_state_dict(given)), config, None)
     record = read_record(given, config)
-    mine = json.loads(json.dumps(dataclasses.asdict(config)))
-    theirs = record["config"]
-    # what decides how a network is built and tested; how it was trained is told, not asked for
-    groups = ("part", "views", "data", "model", config.model.name)
-    names = [name for name in groups if name in mine]
-    found = list(
-        differences(
-            {name: theirs.get(name) for name in names}, {name: mine[name] for name in names}
-        )
-    )
-    if record.get("part", {}).get("sha256") != part.sha256:
-        found.append(f"it is about the part {record.get('part', {}).get('name')}")
-    if found:
-        raise InputError(f"{given}: is no run for this comparison: {'; '.join(found)}")
+    theirs, mine = record["config"], json.loads(json.dumps(dataclasses.asdict(config)))
+    # what decides how a network is built and tested; how it was trained is reported only
+    groups = {"part", "views", "data", "model", config.model.name} & set(mine)
+    problems = list(differences(theirs, {name: mine[name] for name in mine if name in groups}))
+    if record["part"]["sha256"] != part.sha256:
+        problems.append(f"it is about the part {record['part']['name']}")
+    if problems:
+        raise InputError(f"{given}: is no run for this comparison: {'; '.join(problems)}")
     for name in ("training", "loss"):
-        if isinstance(theirs.get(name), dict):
-            settings = getattr(config, name)
-            known = {field.name for field in dataclasses.fields(settings)}
-            values = {key: value for key, value in theirs[name].items() if key in known}
-            setattr(config, name, dataclasses.replace(settings, **values))
+        settings = getattr(config, name)
+        known = values_of(type(settings), settings)
+        values = {key: value for key, value in theirs[name].items() if key in known}
+        setattr(config, name, dataclasses.replace(settings, **values))
     return Trained(load_variables(config, scans, given), config, training_record(given))
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from example_experiment import tiny_experiment
 
 from experiments import compare as command
 from experiments.compare import compare, figures
-from experiments.configs import smoke, table1
+from experiments.configs import table1
 from experiments.runner.registrations import register_views
 from experiments.runner.trained import given_runs, trained
 from experiments.studies.comparison.methods import GROUPS, TABLE_1, TITLES, make_method, settings_of
@@ -22,13 +23,17 @@ from vanejax.matching.baselines.icp import icp
 from vanejax.training.dataset import make_scan_set
 from vanejax.training.pairs import make_bank
 
+pytestmark = pytest.mark.usefixtures("hasty_compiler")
+
 
 def small() -> Comparison:
     """Few pixels and points, two steps of training: its figures mean nothing."""
-    config = Comparison(name="small", experiment=smoke.get_config(), methods=("icp", "pcrnet"))
+    config = Comparison(name="small", experiment=tiny_experiment(), methods=("icp", "pcrnet"))
+    config.experiment.data.num_reference = 256  # with fewer, ICP finds nothing
+    config.experiment.views.elevations_deg = (60.0, 85.0)
     config.experiment.views.azimuths_deg = (0.0, 20.0, 40.0, 180.0)
     config.training.pcrnet = dataclasses.replace(
-        smoke.get_config().training, steps=2, evaluate_every=1, validation_pairs=2
+        config.experiment.training, steps=2, evaluate_every=1
     )
     return config
 
@@ -39,7 +44,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def report(folder: Path) -> dict:
+def report(folder: Path, hasty_compiler) -> dict:
     return compare(small(), folder, {}, progress=False)
 
 

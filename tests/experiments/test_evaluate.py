@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from example_experiment import tiny_experiment
 
-from experiments.configs.smoke import get_config
 from experiments.evaluate import evaluate
 from experiments.runner.evaluation_report import hardest_views, plain, summarize, table
 from experiments.runner.experiment import Experiment
@@ -25,11 +25,13 @@ from vanejax.rigid import RigidTransform
 from vanejax.training.dataset import ScanSet, make_scan_set
 from vanejax.training.pairs import ScanBank, draw_source, make_bank
 
+pytestmark = pytest.mark.usefixtures("hasty_compiler")
+
 
 @pytest.fixture(scope="module")
 def config() -> Experiment:
-    config = get_config()
-    config.views.azimuths_deg = (0.0, 20.0, 40.0, 80.0)
+    config = tiny_experiment()
+    config.views.elevations_deg, config.views.azimuths_deg = (60.0, 85.0), (0.0, 20.0, 40.0, 80.0)
     return config
 
 
@@ -178,7 +180,7 @@ def test_evaluate_writes_json_and_pictures(
     assert json.loads(text, parse_constant=refuse) == report
     assert report["views"] == len(report["rows"]) == 6
     assert report["hardest"]["rows"] == hardest_views(scans.test).tolist()
-    assert report["config"]["name"] == "smoke"
+    assert report["config"]["name"] == "tiny"
     assert report["part"]["sha256"] == config.make_part().sha256
     pictures = ("overlays", "error_map", "axis_errors", "training_curves", "view_and_shadow")
     assert {path.name for path in tmp_path.iterdir()} == {

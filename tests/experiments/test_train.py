@@ -18,10 +18,11 @@ import pytest
 from example_experiment import tiny_experiment
 
 from experiments.runner.experiment import Experiment
-from experiments.runner.run_folder import read_log
+from experiments.runner.run_folder import RunFolder, read_log
 from experiments.runner.stopping import exit_code
 from experiments.runner.training_log import TrainingLog
 from experiments.train import train
+from vanejax.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 STEPS = tiny_experiment().training.steps
@@ -84,7 +85,9 @@ def test_a_run_leaves_everything_it_promises(unbroken: Path) -> None:
     assert not list(unbroken.rglob("*.partial"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
+)
 def test_a_signal_saves_and_the_rest_is_bit_equal(
     unbroken: Path, tmp_path, monkeypatch, capsys, number
 ) -> None:
@@ -111,25 +114,22 @@ def test_another_config_is_refused_by_name(unbroken: Path, capsys) -> None:
 
 def test_a_run_of_an_earlier_version_goes_on(unbroken: Path, tmp_path) -> None:
     """Its config has fewer fields, other names, and losses beside their networks."""
-    workdir = tmp_path / "old"
-    workdir.mkdir()
     record = json.loads((unbroken / "run.json").read_text())
-    config = record["config"]
-    config["endless"] = config.pop("online")
-    del config["data"]["num_source"]
+    old = record["config"]
+    old["endless"] = old.pop("online")
+    del old["data"]["num_source"]
     for name in ("dcp", "pointnetlk", "pcrnet"):
-        config[name] |= config[name].pop("loss")
-    (workdir / "run.json").write_text(json.dumps(record))
+        old[name] |= old[name].pop("loss")
+    (tmp_path / "run.json").write_text(json.dumps(record))
     config = tiny_experiment()
+    part = config.make_part()
+    RunFolder(tmp_path).claim(config, part)
     config.pcrnet.loss.pose = 2.0
-    assert run(config, workdir) == 2
-    config = tiny_experiment()
-    config.training.budget_minutes = 1e-9  # one step is enough to see
-    record["config"]["training"]["budget_minutes"] = 1e-9
-    (workdir / "run.json").write_text(json.dumps(record))
-    assert run(config, workdir) == 0
+    with pytest.raises(InputError, match=r"config\.pcrnet\.loss\.pose was 1\.0, now 2\.0"):
+        RunFolder(tmp_path).claim(config, part)
 
 
+@pytest.mark.slow
 def test_divergence_stops_and_keeps_the_last_good_checkpoint(tmp_path, capsys) -> None:
     workdir, config = tmp_path / "diverged", tiny_experiment()
     config.training.learning_rate, config.training.warmup_steps = 1e30, 8
@@ -158,6 +158,7 @@ def test_a_budget_ends_a_run_for_good(tmp_path) -> None:
     assert arrays_of(workdir, 1)
 
 
+@pytest.mark.slow
 def test_training_on_online_scans_resumes_bit_equal(tmp_path, monkeypatch) -> None:
     """Scan n is the same whoever asks for it: a run that is stopped sees what another one sees."""
     config = tiny_experiment()

@@ -143,6 +143,7 @@ def test_parts_without_a_factor_are_not_computed():
     assert set(made) == {"rotation", "translation", "rotation_error_deg", "translation_error"}
 
 
+@pytest.mark.slow
 def test_a_small_network_learns_one_shape():
     """Poses up to 30 deg of one bumpy blob of 96 points: the rotation error falls by half."""
     model = Dcp(width=64, num_neighbors=8, heads=2, hidden=64)

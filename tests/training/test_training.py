@@ -332,6 +332,7 @@ def test_the_loss_discounts_early_iterations_and_shares_the_reference():
     np.testing.assert_allclose(metrics["pose"], np.mean(last), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_quick_compilation_changes_rounding_only(monkeypatch):
     """And is left alone where XLA knows no such option."""
     arguments = (MODEL, OPTIMIZER, LOSS, SAMPLING)

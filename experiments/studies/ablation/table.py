@@ -47,15 +47,15 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def _spreads(tests: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     if not tests:
         return None
-    told: dict[str, Any] = {
+    totals: dict[str, Any] = {
         name: sum(test[name] for test in tests) for name in ("views", "non_finite_views")
     }
-    for measure in (name for name in tests[0] if name not in told):
-        told[measure] = {
+    for measure in (name for name in tests[0] if name not in totals):
+        totals[measure] = {
             statistic: _spread([test[measure][statistic] for test in tests])
             for statistic in STATISTICS
         }
-    return told
+    return totals
 
 
 def _spread(values: Sequence[float | None]) -> dict[str, float | None]:
@@ -129,10 +129,10 @@ def table(report: Mapping[str, Any]) -> str:
 
 
 def _row(point: Mapping[str, Any], fields: Sequence[str], test: str) -> list[str]:
-    found = point["tests"][test]
+    spreads = point["tests"][test]
 
     def cells(measure: str, *statistics: str) -> list[str]:
-        return [_figure(found[measure][name]) if found else "-" for name in statistics]
+        return [_figure(spreads[measure][name]) if spreads else "-" for name in statistics]
 
     steps = sorted(set(point["steps"]))
     ended = Counter(point["ended_by"])

@@ -32,13 +32,13 @@ class FineStep:
 
     def _view(self, results: Results, view: int) -> Results:
         row: Results = jax.tree.map(lambda leaf: np.asarray(leaf[view]), results)
-        found, truth = row.registration.target_from_source, row.pairs.target_from_source
-        if not np.isfinite(found.as_matrix()).all():
+        estimate, truth = row.registration.target_from_source, row.pairs.target_from_source
+        if not np.isfinite(estimate.as_matrix()).all():
             return row.replace(time_s=np.float64(np.nan))
         # The source was drawn in the part's frame and moved away: taken back, it lies in the camera
         # frame of its view, noise and all, and the method's answer is a pose of that frame.
         part_from_camera = self._scans.viewpoints.view(view).inverse()
-        part_from_source, camera_from_source = self._in_mm(found), self._in_mm(truth)
+        part_from_source, camera_from_source = self._in_mm(estimate), self._in_mm(truth)
         camera_from_source = part_from_camera.inverse() @ camera_from_source
         points = row.pairs.source.xyz[row.pairs.source.mask].astype(np.float64)
         points = camera_from_source.apply(self._scans.radius_mm * points)

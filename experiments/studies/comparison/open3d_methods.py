@@ -69,8 +69,8 @@ def icp(
     criteria = method.ICPConvergenceCriteria(max_iteration=max_iterations)
 
     def align(source: Any, target: Any, start: np.ndarray) -> np.ndarray:
-        found = method.registration_icp(source, target, max_distance, start, estimation, criteria)
-        return found.transformation
+        result = method.registration_icp(source, target, max_distance, start, estimation, criteria)
+        return result.transformation
 
     return _register(open3d, align, max_distance)
 
@@ -106,7 +106,7 @@ def ransac(
             method.CorrespondenceCheckerBasedOnEdgeLength(edge_similarity),
             method.CorrespondenceCheckerBasedOnDistance(max_distance),
         ]
-        found = method.registration_ransac_based_on_feature_matching(
+        result = method.registration_ransac_based_on_feature_matching(
             source,
             target,
             *features,
@@ -117,7 +117,7 @@ def ransac(
             checks,
             method.RANSACConvergenceCriteria(num_hypotheses, confidence),
         )
-        return found.transformation
+        return result.transformation
 
     return _register(open3d, align, max_distance)
 
@@ -162,8 +162,10 @@ def fgr(
             tuple_scale=tuple_similarity,
             maximum_tuple_count=num_tuples,
         )
-        found = method.registration_fgr_based_on_feature_matching(source, target, *features, option)
-        return found.transformation
+        result = method.registration_fgr_based_on_feature_matching(
+            source, target, *features, option
+        )
+        return result.transformation
 
     return _register(open3d, align, max_distance)
 
@@ -205,14 +207,14 @@ def _register(open3d: ModuleType, align: Align, max_distance: float) -> Register
         enough = min(len(cloud.points) for cloud in clouds) >= FEWEST
         # its warning of few mutual matches comes with every second pair
         with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-            found = align(*clouds, start) if enough else start
+            result = align(*clouds, start) if enough else start
         # where nothing was found, RANSAC and FGR answer with the identity
-        converged = enough and np.isfinite(found).all()
+        converged = enough and np.isfinite(result).all()
         if not converged:
-            found = start
-        fit = open3d.pipelines.registration.evaluate_registration(*clouds, max_distance, found)
+            result = start
+        fit = open3d.pipelines.registration.evaluate_registration(*clouds, max_distance, result)
         return Registration(
-            target_from_source=RigidTransform.from_matrix(np.array(found, np.float32)),
+            target_from_source=RigidTransform.from_matrix(np.array(result, np.float32)),
             converged=np.bool_(converged and fit.fitness > 0),
             iterations=np.int32(0),  # Open3D does not say
             rmse=np.float32(fit.inlier_rmse),

@@ -58,19 +58,19 @@ def beside_open3d(report: Mapping[str, Any]) -> list[str]:
 
     The goal is an error of at most `MOST_ERROR` times Open3D's.
     """
-    found = {method["name"]: method for method in report["methods"] if "alone" in method}
+    methods = {method["name"]: method for method in report["methods"] if "alone" in method}
     lines = []
     for ours, theirs in PEERS.items():
-        if not {ours, theirs} <= set(found):
+        if not {ours, theirs} <= set(methods):
             continue
-        one, other = (found[name]["alone"]["summary"] for name in (ours, theirs))
+        own, peer = (methods[name]["alone"]["summary"] for name in (ours, theirs))
         turn, shift, time = (
-            one[name]["median"] / other[name]["median"]
+            own[name]["median"] / peer[name]["median"]
             for name in ("rotation_error_deg", "translation_error_mm", "time_s")
         )
         met = "met" if max(turn, shift) <= MOST_ERROR else "MISSED"
         lines.append(
-            f"- {found[ours]['title']} beside {found[theirs]['title']}: {turn:.2f} times its "
+            f"- {methods[ours]['title']} beside {methods[theirs]['title']}: {turn:.2f} times its "
             f"median rotation error, {shift:.2f} times its translation error "
             f"(goal {MOST_ERROR:g}: {met}), {time:.1f} times its time."
         )
@@ -101,19 +101,19 @@ def _cells(method: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def training_line(title: str, told: Mapping[str, Any]) -> str:
+def training_line(title: str, training: Mapping[str, Any]) -> str:
     """How long a network was trained, and whether its curve is flat."""
-    steps = f"{told['steps']:,} steps"
-    if told["ended_by"] == "budget":
-        steps = f"{steps} of {told['wanted_steps']:,}, ended by its budget of time"
-    fall = told["fall_in_last_quarter"]
+    steps = f"{training['steps']:,} steps"
+    if training["ended_by"] == "budget":
+        steps = f"{steps} of {training['wanted_steps']:,}, ended by its budget of time"
+    fall = training["fall_in_last_quarter"]
     curve = "too few validations to say whether the curve is flat"
     if fall is not None:
         curve = (
             f"validation error {'fell by' if fall >= 0 else 'rose by'} {abs(fall):.0%} in the last "
-            f"quarter: {'flat' if told['flat'] else 'not flat yet'}"
+            f"quarter: {'flat' if training['flat'] else 'not flat yet'}"
         )
-    return f"- {title}: {steps}, {told['hours']:.2f} h; {curve}."
+    return f"- {title}: {steps}, {training['hours']:.2f} h; {curve}."
 
 
 def _spread(figures: Mapping[str, float]) -> str:

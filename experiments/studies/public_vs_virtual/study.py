@@ -1,15 +1,6 @@
 """RPM-Net trained on generic shapes against RPM-Net trained on virtual scans (paper, Figs 8, 9).
 
-python -m experiments.public_vs_virtual --config public.py [--workdir runs/public]
-    [--config.data.shapes=PATH] [--trained virtual=runs/vane] [--config.FIELD=VALUE ...]
-    [--trained public=partial-trained.pth]
-
-Both have the same network, loss, optimizer and number of steps; only what they see differs. Both
-register the same 54 test views of the part. ``data.shapes`` is where ModelNet40 is, a file of
-shapes, or "solids" for a procedural family of solids. A checkpoint of the published PyTorch code
-may stand in for the network trained on public shapes.
-
-VANEJAX_CACHE_DIR is where compiled programs are kept (~/.cache/vanejax); off keeps none.
+The command is `experiments.public_vs_virtual`.
 """
 
 from __future__ import annotations
@@ -23,7 +14,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.compare import figures, training_told
+from experiments.compare import figures, training_summary
 from experiments.evaluate import registered
 from experiments.runner import study_command as study
 from experiments.runner.evaluation_report import hardest_views
@@ -82,12 +73,12 @@ def public_vs_virtual(
         folder = runs.get(name, workdir / name)
         network = trained(settings, part, scans, workdir / name, runs.get(name))
         shapes = folder / "shapes.json"
-        told = {"title": "virtual scans of the part"}
+        source = {"title": "virtual scans of the part"}
         if folder.is_file():
-            told = {"title": f"whatever {folder.name} was trained on"}
+            source = {"title": f"whatever {folder.name} was trained on"}
         elif shapes.exists():
-            told = read_json(shapes)
-        sources[name] = told | {"training": training_told(network)}
+            source = read_json(shapes)
+        sources[name] = source | {"training": training_summary(network)}
         results[name] = registered(settings, scans, network.variables, progress=progress)
     report = {
         "name": config.name,
@@ -98,10 +89,10 @@ def public_vs_virtual(
     for title, views in (("hardest", hardest_views(scans.test)), ("all", slice(None))):
         series = {
             sources[name]["title"]: plotting.AxisErrors(
-                rotation_deg=found.errors.rotation_axes_deg[views],
-                translation_mm=found.errors.translation_axes_mm[views],
+                rotation_deg=result.errors.rotation_axes_deg[views],
+                translation_mm=result.errors.translation_axes_mm[views],
             )
-            for name, found in results.items()
+            for name, result in results.items()
         }
         plotting.save_figure(plotting.axis_errors(series), workdir / f"axis_errors_{title}.png")
     print(table(report))
@@ -134,17 +125,17 @@ def compared(results: Mapping[str, Results], test: ScanSet) -> dict[str, Any]:
     """Errors of both on all test views and on the hardest, and by how much one is lower."""
     rows = {"all": np.arange(len(test)), "hardest": hardest_views(test)}
     report: dict[str, Any] = {"views": {name: len(views) for name, views in rows.items()}}
-    for name, found in results.items():
-        report[name] = figures(found, test)
+    for name, result in results.items():
+        report[name] = figures(result, test)
     for name, views in rows.items():
         errors = {
             source: {
-                "mre_per_axis_deg": mean_per_axis(found.errors.rotation_axes_deg[views]),
-                "mte_per_axis_mm": mean_per_axis(found.errors.translation_axes_mm[views]),
-                "mre_per_view_deg": mean_per_view(found.errors.rotation_axes_deg[views]),
-                "mte_per_view_mm": mean_per_view(found.errors.translation_axes_mm[views]),
+                "mre_per_axis_deg": mean_per_axis(result.errors.rotation_axes_deg[views]),
+                "mte_per_axis_mm": mean_per_axis(result.errors.translation_axes_mm[views]),
+                "mre_per_view_deg": mean_per_view(result.errors.rotation_axes_deg[views]),
+                "mte_per_view_mm": mean_per_view(result.errors.translation_axes_mm[views]),
             }
-            for source, found in results.items()
+            for source, result in results.items()
         }
         turned, moved = (
             1.0 - float(np.mean(errors[VIRTUAL][key]) / np.mean(errors[PUBLIC][key]))
@@ -194,8 +185,8 @@ def table(report: Mapping[str, Any]) -> str:
             f"(rotation {fall['rotation']:.0%}, translation {fall['translation']:.0%}); the paper "
             f"says about {fall['paper']:.0%}.",
         ]
-    trained_on = [told for told in report["trained_on"].values() if told["training"]]
-    lines += ["", *(training_line(told["title"], told["training"]) for told in trained_on)]
+    trained_on = [source for source in report["trained_on"].values() if source["training"]]
+    lines += ["", *(training_line(source["title"], source["training"]) for source in trained_on)]
     return "\n".join(lines)
 
 
