@@ -42,24 +42,20 @@ def placements(
     camera_mm: float = 0.0,
     probe_mm: float = 0.0,
     touched: int = 9,
-    reach_mm: float = 58.0,
 ) -> tuple[list[Cube], list[Cube]]:
-    """Cubes of camera and machine, the camera's faces named as it happens.
-
-    The probe touches each face within ``reach_mm`` of the corner.
-    """
+    """Cubes of camera and machine, the camera's faces named as it happens."""
     rng = np.random.default_rng(seed)
     cubes: tuple[list[Cube], list[Cube]] = ([], [])
     for _ in range(count):
         camera_from_cube = placement(rng)
         machine_from_cube = MACHINE_FROM_CAMERA @ camera_from_cube
-        for mine, frame, noise, number, reach in (
-            (cubes[0], camera_from_cube, camera_mm, 300, 58.0),
-            (cubes[1], machine_from_cube, probe_mm, touched, reach_mm),
+        for mine, frame, noise, number in (
+            (cubes[0], camera_from_cube, camera_mm, 300),
+            (cubes[1], machine_from_cube, probe_mm, touched),
         ):
             points = []
             for k in range(3):
-                exact = face_points(k, rng.uniform(-reach, -2, (number, 2)))
+                exact = face_points(k, rng.uniform(-58, -2, (number, 2)))
                 exact[:, k] += noise * rng.standard_normal(number)
                 points.append(frame.apply(exact))
             shift = rng.integers(3) if mine is cubes[0] else 0
@@ -83,9 +79,7 @@ def test_strays_do_not_move_a_plane():
     face = fit_face(points)
     assert np.degrees(np.arccos(abs(face.normal[2]))) < 0.02
     assert abs(face.center[2]) < 0.01
-    plain = points - points.mean(axis=0)
     assert abs(np.mean(points[:, 2])) > 0.1, "the strays would have moved a plain mean"
-    assert len(plain) == face.count
 
 
 @pytest.mark.parametrize("count", [3, 4, 9])
@@ -224,20 +218,6 @@ def test_the_joint_fit_is_honest_and_better_than_the_mean():
     assert np.linalg.norm(rms[0][:3]) < 0.95 * np.linalg.norm(rms[1][:3])
     assert np.linalg.norm(rms[0][3:]) < 0.95 * np.linalg.norm(rms[1][3:])
     assert 0.6 < np.mean(np.square(rms[1]) / np.mean(spread, axis=0)) < 1.6
-
-
-@pytest.mark.slow
-def test_planes_that_were_touched_at_one_end_are_weighed_by_their_lever():
-    """A noisy scan's planes tilt: where they are touched decides what that does to the offset."""
-    chi, misfit = [], []
-    for seed in range(40):
-        cubes = placements(300 + seed, camera_mm=0.5, probe_mm=0.002, touched=6, reach_mm=25.0)
-        found = calibrate(*cubes)
-        e = error(found.machine_from_camera, found.center)
-        chi.append(e @ np.linalg.solve(found.covariance / max(1, found.misfit**2), e))
-        misfit.append(found.misfit)
-    assert 4.3 < np.mean(chi) < 7.7  # 6 +- 0.55
-    assert np.mean(np.square(misfit)) == pytest.approx(1, abs=0.1)  # 2,640 freedoms: 3 %
 
 
 def test_a_cube_that_is_not_square_does_not_matter():

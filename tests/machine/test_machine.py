@@ -234,13 +234,3 @@ def test_the_compensation_leads_from_nominal_to_actual(one: Rotation, other: Rot
     # one motion in two frames: the same angle, and conjugate
     seen = nominal @ found.in_part @ nominal.inverse()
     np.testing.assert_allclose(seen.as_matrix(), found.in_machine.as_matrix(), rtol=0, atol=1e-9)
-
-
-def test_the_compensation_of_a_shifted_part() -> None:
-    """Turned by 90 deg about the machine's z and moved by 10 mm in x: by hand."""
-    nominal = RigidTransform(np.eye(3), np.array([100.0, 0.0, 0.0]))
-    actual = RigidTransform(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([110.0, 0, 0]))
-    found = Compensation(actual, nominal)
-    np.testing.assert_array_equal(found.in_part.translation, [10, 0, 0])
-    np.testing.assert_array_equal(found.in_machine.translation, [110, -100, 0])
-    np.testing.assert_array_equal(found.in_machine.apply(np.array([[101.0, 0, 0]])), [[110, 1, 0]])

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from vanejax.errors import InputError
 from vanejax.matching.baselines.pointnet import WIDTHS, registration_from_pose
 from vanejax.matching.baselines.pointnetlk import PointNetLK, pointnetlk
-from vanejax.matching.torch_weights import pointnetlk_variables
+from vanejax.matching.torch_weights import convert_state_dict, load_state_dict, pointnetlk_variables
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 
@@ -313,6 +313,13 @@ def test_import_refuses_another_model_and_names_what_differs(changes, words):
     state = {name: value for name, value in (state_dict() | changes).items() if value is not None}
     with pytest.raises(InputError, match=words.replace(".", r"\.")):
         pointnetlk_variables(state)
+
+
+def test_a_state_dict_is_converted_once(tmp_path):
+    np.savez(tmp_path / "a.npz", **state_dict())
+    assert convert_state_dict(tmp_path / "a.npz", tmp_path / "a.safetensors")[0] == "PointNetLK"
+    converted = pointnetlk_variables(load_state_dict(tmp_path / "a.safetensors"))
+    jax.tree.map(np.testing.assert_array_equal, converted, variables())
 
 
 def test_import_does_not_need_the_count_of_batches():
