@@ -1,4 +1,4 @@
-"""Times of RPM-Net: a step of training and a registration, beside PyTorch and beside arithmetic."""
+"""Times of RPM-Net: a training step and a registration, with PyTorch and arithmetic."""
 
 from __future__ import annotations
 
@@ -81,12 +81,12 @@ def training(pairs: VanePairs) -> Callable[[], float]:
     """Steps of one training run, each of which gives its loss."""
     train_step, state = pairs.train_step(), pairs.state()
 
-    def one() -> float:
+    def step() -> float:
         nonlocal state
         state, metrics = train_step(state, pairs.bank)
         return float(metrics["loss"])
 
-    return one
+    return step
 
 
 def registering(pairs: VanePairs) -> Callable[[], RigidTransform]:
@@ -124,8 +124,8 @@ def torch_step(bench: Bench, pairs: VanePairs) -> tuple[list[float], str]:
     batch = [pairs.pair(seed) for seed in range(pairs.batch)]
     tensors = [torch.tensor(np.stack(arrays)) for arrays in zip(*map(_arrays, batch), strict=True)]
     iterations = pairs.config.loss.iterations
-    one = torch_rpmnet.make_train_step(model, iterations=iterations)
-    seconds, loss = bench.time(lambda: one(*tensors))
+    step = torch_rpmnet.make_train_step(model, iterations=iterations)
+    seconds, loss = bench.time(lambda: step(*tensors))
     note = f"a reference for each pair, {torch.get_num_threads()} threads, loss {loss:.3f}"
     return seconds, note
 

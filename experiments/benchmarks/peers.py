@@ -25,7 +25,7 @@ def open3d_icp(bench: Bench) -> tuple[list[float], str]:
     target.normals = open3d.utility.Vector3dVector(normals)
     source.points = open3d.utility.Vector3dVector(bench.points)
     method = open3d.pipelines.registration
-    seconds, found = bench.time(
+    seconds, result = bench.time(
         lambda: method.registration_icp(
             source,
             target,
@@ -35,7 +35,7 @@ def open3d_icp(bench: Bench) -> tuple[list[float], str]:
             method.ICPConvergenceCriteria(1e-9, 1e-9, MOST_ITERATIONS),
         )
     )
-    return seconds, bench.error(RigidTransform.from_matrix(np.asarray(found.transformation)))
+    return seconds, bench.error(RigidTransform.from_matrix(np.asarray(result.transformation)))
 
 
 @peer(SMALL_GICP)
@@ -48,7 +48,7 @@ def small_gicp_icp(bench: Bench) -> tuple[list[float], str]:
     tree = small_gicp.KdTree(target)
     small_gicp.estimate_normals(target, tree)
     source = small_gicp.PointCloud(bench.points)
-    seconds, found = bench.time(
+    seconds, result = bench.time(
         lambda: small_gicp.align(
             target,
             source,
@@ -62,4 +62,4 @@ def small_gicp_icp(bench: Bench) -> tuple[list[float], str]:
             translation_epsilon=1e-5,
         )
     )
-    return seconds, bench.error(RigidTransform.from_matrix(np.asarray(found.T_target_source)))
+    return seconds, bench.error(RigidTransform.from_matrix(np.asarray(result.T_target_source)))

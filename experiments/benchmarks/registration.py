@@ -63,7 +63,7 @@ def bare_rays(
 
 
 def refine_against_casts(bench: Bench) -> Iterator[Figure]:
-    """`refine`, beside the time that Embree alone needs for as many rays of the same scan."""
+    """`refine`, compared with the time of Embree alone for as many rays of the same scan."""
     model, points, start = bench.views.model, bench.points, bench.rough
     counted = CountedRays(model.scanner, model.surface, model.sensor_origin)
     refine(counted, points, start)
@@ -79,14 +79,14 @@ def refine_against_casts(bench: Bench) -> Iterator[Figure]:
     yield Figure("bare casts of refine", seconds, note=note)
     yield open3d_icp(bench)
     yield small_gicp_icp(bench)
-    seconds, found = bench.time(lambda: refine(model, points, start))
+    seconds, result = bench.time(lambda: refine(model, points, start))
     yield Figure(
         "refine",
         seconds,
         peers={OPEN3D_ICP: 1.0, SMALL_GICP: 1.0},
         limits={"bare casts of refine": None},
         goal_s=0.5,
-        note=f"{len(points):,} points, {bench.error(found.part_from_camera)}",
+        note=f"{len(points):,} points, {bench.error(result.part_from_camera)}",
     )
 
 

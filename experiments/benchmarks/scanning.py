@@ -1,4 +1,4 @@
-"""Time of the virtual scanner: every view, beside Open3D and beside Embree alone."""
+"""Time of the virtual scanner: every view, compared with Open3D and with Embree alone."""
 
 from __future__ import annotations
 
@@ -65,8 +65,10 @@ def open3d_scan(bench: Bench, sample: range, scale: float, stated: str) -> tuple
         points = seen[:, :3] + seen[:, 3:] * answer["t_hit"][hit].reshape((-1, 1))
         return points, answer["primitive_normals"][hit], answer["primitive_ids"][hit]
 
-    seconds, found = bench.time(lambda: [len(cast(view)[0]) for view in sample])
-    note = f"rays, casts, points, normals, faces; {stated}; {scale * sum(found) / 1e6:.1f} M points"
+    seconds, counts = bench.time(lambda: [len(cast(view)[0]) for view in sample])
+    note = (
+        f"rays, casts, points, normals, faces; {stated}; {scale * sum(counts) / 1e6:.1f} M points"
+    )
     return [scale * spent for spent in seconds], note
 
 

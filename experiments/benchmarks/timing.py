@@ -104,7 +104,7 @@ class Bench:
 
     @functools.cached_property
     def rough(self) -> RigidTransform:
-        """part_from_camera beside the true one."""
+        """part_from_camera, near the true one."""
         rng = np.random.default_rng([self.seed, 1])
         truth = self.views.truth(self.view)
         return perturb(truth, self.views.part, deg=START_DEG, mm=START_MM, rng=rng)

@@ -8,7 +8,6 @@ from typing import Any
 
 from experiments.pages import tables
 from experiments.pages.reproduction.studies import ROOT
-from experiments.pages.summary_table import summary_table
 from experiments.runner.markdown import provenance, text_block, with_blocks
 from experiments.studies.ablation import table as ablation_table
 from experiments.studies.any_pose import study as any_pose
@@ -90,7 +89,7 @@ def block(name: str, results: Mapping[str, Report]) -> str:
       KeyError: no block has this name, or there is no record of it.
     """
     if name == "measured":
-        return summary_table(results)
+        return tables.summary_table(results)
     if name in GROUPS:
         return "\n\n".join(block(part, results) for part in GROUPS[name])
     record, table = BLOCKS[name]

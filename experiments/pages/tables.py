@@ -1,15 +1,22 @@
-"""Tables of the records whose studies have none in Markdown: training, tuning, benchmark."""
+"""The summary, and tables of the studies that have none in Markdown: training, tuning, times."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
+
+import jinja2
 
 from experiments.benchmarks.timing import comparison, shown
 from experiments.runner.markdown import table
 from experiments.studies.comparison.methods import TITLES
+from experiments.studies.position import report as stand
+from experiments.studies.real_scans import study as real_scans
+from experiments.studies.robustness import study as robustness
 
 Report = Mapping[str, Any]
+NOISE_MM = 0.1  # of the levels of `experiments.fine`
 MEASURES = {
     "rotation_error_deg": "rotation error (deg)",
     "translation_error_mm": "translation error at the part's centre (mm)",
@@ -17,6 +24,33 @@ MEASURES = {
     "rmse_mm": "RMSE, eq. 1 (mm)",
     "time_s": "time per registration (s)",
 }
+
+
+def summary_table(results: Mapping[str, Report]) -> str:
+    """The README's table of the main figures: the template summary.md."""
+    benchmark = {row["name"]: row for row in results["benchmark"]["rows"]}
+
+    def seconds(name: str) -> str:
+        return f"{benchmark[name]['seconds']['median']:.2g} s"
+
+    def ratio(name: str, peer: str) -> str:
+        (entry,) = (entry for entry in benchmark[name]["against"] if entry["name"] == peer)
+        return f"{entry['ratio']:.1f}"
+
+    position, levels = results["position"], results["fine"]["levels"]
+    template = jinja2.Template(Path(__file__).with_name("summary.md").read_text())
+    return template.render(
+        results,
+        level=next(level for level in levels if level["noise_mm"] == NOISE_MM),
+        turns=stand.magnitudes(position, stand.turns_of, "error_deg"),
+        moves=stand.magnitudes(position, stand.moves_of, "against_probe_mm"),
+        paper=stand.PAPER,
+        random=results["robustness"]["random"],
+        random_right=(robustness.RIGHT_DEG, robustness.RIGHT_MM),
+        real_right=(real_scans.RIGHT_DEG, real_scans.RIGHT_MM),
+        seconds=seconds,
+        ratio=ratio,
+    )
 
 
 def evaluation_table(report: Report) -> str:

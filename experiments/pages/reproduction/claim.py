@@ -1,6 +1,6 @@
 """A claim and its verdict, computed from the records alone.
 
-The paper's numbers stand beside the claims and in the studies that compare with them
+The paper's numbers stand in the claims and in the studies that compare with them
 (`methods.TABLE_1`, `position_report.PAPER`, the series of `robustness.json`).
 """
 

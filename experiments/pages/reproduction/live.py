@@ -1,4 +1,4 @@
-"""Measured afresh, against the record: the pretrained network and the stand."""
+"""Measured again for the report: the pretrained network and the virtual stand."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Live:
       weights: the network's file or origin, in words.
       trained: the commit that it was trained from, as far as known.
       seconds: scans, registrations and pictures.
-      position: what `experiments.position` found, where it was run.
+      position: the record of `experiments.position`, where it was run.
     """
 
     report: dict[str, Any]

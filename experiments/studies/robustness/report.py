@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from experiments.runner.markdown import table as markdown_table
 from experiments.runner.required_accuracy import NEED_MM, within_need
 from vanejax.plotting.canvas import (
     INK,
@@ -116,22 +117,12 @@ def table(report: Report) -> str:
 
 
 def markdown(report: Report) -> str:
-    """The same for docs/robustness.md."""
-    blocks = []
-    for series in report["series"]:
-        rows = list(series_lines(report, series))
-        blocks.append(
-            "\n".join(
-                [
-                    f"### {series['title']} ({series['unit']}){_paper(series)}",
-                    "",
-                    "| " + " | ".join(HEADERS) + " |",
-                    "|" + "---|" * len(HEADERS),
-                    *("| " + " | ".join(row) + " |" for row in rows),
-                ]
-            )
-        )
-    return "\n\n".join(blocks)
+    """The same in Markdown."""
+    return "\n\n".join(
+        f"### {series['title']} ({series['unit']}){_paper(series)}\n\n"
+        + markdown_table(HEADERS, series_lines(report, series))
+        for series in report["series"]
+    )
 
 
 def random_lines(found: Report) -> str:

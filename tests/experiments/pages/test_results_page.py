@@ -11,7 +11,7 @@ from experiments import performance_page, results_page
 from experiments.pages import blocks, tables
 from experiments.pages.blocks import page, pages
 from experiments.pages.reproduction.studies import RESULTS, recorded
-from experiments.pages.summary_table import summary_table
+from experiments.pages.tables import summary_table
 from experiments.runner.markdown import provenance, with_blocks
 
 PAGES = pages()
