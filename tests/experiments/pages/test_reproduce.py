@@ -73,6 +73,7 @@ def test_the_plan_says_what_is_done_and_left_out(tmp_path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_and_names_what_failed(tmp_path, monkeypatch, capsys) -> None:
     """Real studies in processes of their own: one that works, one that fails, one in need of it."""
     broken = dataclasses.replace(

@@ -9,7 +9,7 @@ import pytest
 from example_position import stand_record
 
 from experiments.pages.reproduction.claim import Claim, Verdict, digits
-from experiments.pages.reproduction.document import PICTURES, TOPICS, document, to_markdown
+from experiments.pages.reproduction.document import TOPICS, document, to_markdown
 from experiments.pages.reproduction.studies import BY_RECORD, recorded
 
 CLAIMS = [claim for topic in TOPICS.values() for claim in topic.claims]
@@ -156,7 +156,6 @@ def test_every_topic_is_on_the_page_with_claims_of_one_kind(results) -> None:
         assert text.count(f"\n## {topic.title}\n") == 1
         assert topic.claims
         assert {bool(claim.place) for claim in topic.claims} == {topic.of_paper}
-    assert set(PICTURES) <= set(BY_RECORD)
 
 
 @pytest.mark.parametrize(
