@@ -183,10 +183,10 @@ def test_evaluate_writes_json_and_pictures(
     assert report["config"]["name"] == "tiny"
     assert report["part"]["sha256"] == config.make_part().sha256
     pictures = ("overlays", "error_map", "axis_errors", "training_curves", "view_and_shadow")
+    names = (*pictures, "overview")
     assert {path.name for path in tmp_path.iterdir()} == {
         "evaluation.json",
-        "overview.png",
-        *(f"{name}.png" for name in pictures),
+        *(f"{name}.{kind}" for name in names for kind in ("png", "pdf")),
     }
     printed = capsys.readouterr().out
     assert "rotation error (deg)" in printed

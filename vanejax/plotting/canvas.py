@@ -64,7 +64,6 @@ SENSORS = {
     "ideal": Style(FAINT, ":", "s"),
     "consumer_depth": Style("#d55e00", "--", "^"),
 }
-STAGES = {"alone": "--", "refined": "-"}  # lines before and after refinement by ray casting
 
 WIDTH_IN = 7.2  # of two columns in print; a wider figure would be printed smaller than drawn
 TITLE_PT, LABEL_PT, TICK_PT = 9.0, 8.0, 7.5
