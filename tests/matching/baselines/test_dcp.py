@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.special
+from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
 
 from vanejax.matching.baselines.dcp import Dcp, dcp, last_match
@@ -18,11 +19,6 @@ from vanejax.rigid import RigidTransform
 N = M = 24
 MODEL = Dcp(width=32, num_neighbors=5, heads=2, hidden=16)
 EXACT = 1e-9  # f64 eps x the network's condition of about 1e5
-# these networks run for milliseconds: a fifth of the time to compile is worth slower code
-jit = functools.partial(
-    jax.jit,
-    compiler_options={"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
-)
 
 
 def problem() -> tuple[np.ndarray, np.ndarray]:
@@ -62,7 +58,7 @@ def single(tree):
     return jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), tree)
 
 
-@functools.partial(jit, static_argnames="iterations")
+@functools.partial(quick_jit, static_argnames="iterations")
 def _run(variables, source, target, init, iterations):
     return MODEL.apply(variables, source, target, init, iterations)
 
@@ -93,7 +89,7 @@ def test_scores_pointer_partners_and_pose_from_the_two_networks():
     xyz, target_xyz = problem()
     source, target = cloud(xyz), cloud(target_xyz)
 
-    @jit
+    @quick_jit
     def both(variables, source, target):
         networks = MODEL.bind(variables)
         f, g = (networks.dgcnn(c.xyz, c.mask) for c in (source, target))
@@ -158,8 +154,8 @@ def test_the_last_match_is_the_last_of_all_and_shares_the_reference():
     source, target = (cloud(points) for points in problem())
     variables, init = exact_variables(), RigidTransform(np.eye(3), np.zeros(3))
     expected = run(variables, source, target, init, 2)[-1]
-    shared = jit(functools.partial(MODEL.apply, method="embed"))(variables, target)
-    last = jit(functools.partial(last_match, MODEL, iterations=2))
+    shared = quick_jit(functools.partial(MODEL.apply, method="embed"))(variables, target)
+    last = quick_jit(functools.partial(last_match, MODEL, iterations=2))
     found = last(variables, source, target, init, target_embedding=shared)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-7)
@@ -170,7 +166,7 @@ def test_the_last_match_is_the_last_of_all_and_shares_the_reference():
 
 @functools.cache
 def jitted():
-    return jit(dcp(MODEL, single(exact_variables())))
+    return quick_jit(dcp(MODEL, single(exact_variables())))
 
 
 def starts(count: int) -> RigidTransform:
@@ -219,7 +215,7 @@ def pose_gradient():
     xyz, target_xyz = single(problem())
     source, target = cloud(xyz, N + 9), cloud(target_xyz, M + 11)
 
-    @jit
+    @quick_jit
     def gradient(source_xyz):
         def total(variables, source_xyz, target_xyz):
             moved, fixed = source.replace(xyz=source_xyz), target.replace(xyz=target_xyz)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from quick_jit import quick_jit
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -24,12 +25,12 @@ KEY = jax.random.key(0)
 WIDTH = 0.08  # of kernels
 METRICS = ("point_to_point", "point_to_plane")
 
-nearest = jax.jit(nearest_neighbors)
+nearest = quick_jit(nearest_neighbors)
 
 
 @functools.cache
 def register(**settings):
-    return jax.jit(icp(**{"max_distance": 0.3} | settings))
+    return quick_jit(icp(**{"max_distance": 0.3} | settings))
 
 
 def cloud(xyz: np.ndarray, normals: np.ndarray, dtype=np.float32, place=None) -> PointCloud:
@@ -148,7 +149,7 @@ def test_one_iteration_is_the_slow_twin(metric, kernel, trim):
     expected = slow_step(source, target, init, metric, kernel, trim)
     width = None if kernel == "none" else WIDTH
     with jax.enable_x64(True):
-        found = jax.jit(
+        found = quick_jit(
             icp(
                 metric=metric,
                 max_iterations=1,

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
 
 from vanejax.matching.baselines.pcrnet import PcrNet, pcrnet
@@ -55,12 +56,12 @@ def pose(seed: int, size: float = 1.0) -> RigidTransform:
     return RigidTransform(np.float32(turn), np.float32(rng.normal(size=3, scale=0.3)))
 
 
-@jax.jit
+@quick_jit
 def run(weights, source, target, init, template=None):
     return MODEL.apply(weights, source, target, init, ITERATIONS, template=template)
 
 
-register = jax.jit(pcrnet(MODEL, variables(), iterations=ITERATIONS))
+register = quick_jit(pcrnet(MODEL, variables(), iterations=ITERATIONS))
 
 
 # ---- the slow twin: numpy float64, from the paper ----
@@ -117,7 +118,7 @@ def test_a_template_that_is_shared_changes_nothing():
 
 def test_untrained_it_moves_nothing():
     source, target = problem()
-    fresh = jax.jit(lambda *clouds: MODEL.init(KEY, *clouds, START, 1))(
+    fresh = quick_jit(lambda *clouds: MODEL.init(KEY, *clouds, START, 1))(
         cloud(source), cloud(target)
     )
     init = pose(2)
@@ -161,7 +162,7 @@ def test_a_quaternion_of_any_length_is_a_rotation(scale):
 def test_gradients_reach_every_layer_and_no_padding():
     clouds = [cloud(points) for points in problem()]
 
-    @jax.jit
+    @quick_jit
     def gradient(weights, *clouds):
         def total(weights, *places):
             moved = (c.replace(xyz=xyz) for c, xyz in zip(clouds, places, strict=True))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
@@ -74,7 +75,7 @@ def pose(seed: int, size: float = 1.0) -> RigidTransform:
     return RigidTransform(np.float32(turn), np.float32(rng.normal(size=3, scale=0.3)))
 
 
-@functools.partial(jax.jit, static_argnames=("model", "iterations"))
+@functools.partial(quick_jit, static_argnames=("model", "iterations"))
 def run(model, weights, source, target, init, iterations=4):
     return model.apply(weights, source, target, init, iterations)
 
@@ -82,8 +83,8 @@ def run(model, weights, source, target, init, iterations=4):
 MODEL = PointNetLK()
 KEY = jax.random.key(0)
 START = jax.tree.map(jnp.asarray, RigidTransform.identity())
-register = jax.jit(pointnetlk(MODEL, variables(), iterations=4))
-judge = jax.jit(functools.partial(registration_from_pose, iterations=4, partner_distance=0.1))
+register = quick_jit(pointnetlk(MODEL, variables(), iterations=4))
+judge = quick_jit(functools.partial(registration_from_pose, iterations=4, partner_distance=0.1))
 
 
 # ---- the slow twin: numpy float64, from the paper and the PyTorch layers it names ----
@@ -159,7 +160,7 @@ def test_the_residual_is_what_the_steps_came_from():
     centered = source - source.mean(axis=0), target - target.mean(axis=0)
     expected = slow_feature(centered[0]) - slow_feature(centered[1])
     np.testing.assert_allclose(found.residual[0], expected, atol=2e-5)  # f32 eps x 100
-    template = jax.jit(functools.partial(MODEL.apply, method="template"))(
+    template = quick_jit(functools.partial(MODEL.apply, method="template"))(
         variables(), cloud(target)
     )
     steps = -found.residual @ template.twist_from_feature.T
@@ -227,7 +228,7 @@ def test_registration_says_what_it_rests_on():
 def test_a_step_that_is_still_long_has_not_converged():
     """After one step from 3 deg; after four it has, see the rigid copy above."""
     _, target = problem()
-    eager = jax.jit(pointnetlk(MODEL, variables(), iterations=1))
+    eager = quick_jit(pointnetlk(MODEL, variables(), iterations=1))
     source = pose(1, 0.03).inverse().apply(target)
     assert not eager(cloud(source), cloud(target), START, KEY).converged
 
@@ -257,7 +258,7 @@ def test_gradients_reach_every_layer_and_no_padding():
     source, target = problem()
     clouds = cloud(source), cloud(target)
 
-    @jax.jit
+    @quick_jit
     def gradient(weights, *clouds):
         def total(weights, *places):
             moved = (c.replace(xyz=xyz) for c, xyz in zip(clouds, places, strict=True))
@@ -336,7 +337,7 @@ def test_parity_with_the_published_weights():
     weights = pointnetlk_variables(
         {name[2:]: value for name, value in io.items() if name.startswith("w:")}
     )
-    describe = jax.jit(functools.partial(MODEL.apply, method="template"))
+    describe = quick_jit(functools.partial(MODEL.apply, method="template"))
     for pair in range(3):
         source, target = (cloud(io[name][pair], 1024) for name in ("source", "template"))
         feature = describe(weights, target).feature
