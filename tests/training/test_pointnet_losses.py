@@ -157,6 +157,7 @@ def test_the_loss_is_its_slow_twin(outcome):
         np.testing.assert_allclose(metrics[part], mean, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_gradients_tell_how_the_loss_grows(outcome):
     """One iteration, where no pose is held constant: the template's part counts as well."""
     name, pairs, _ = outcome
