@@ -138,7 +138,7 @@ def matched(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> list
             f"a calibration needs the same placements from both, at least one; got "
             f"{len(camera_cubes)} cubes of the camera and {len(machine_cubes)} of the machine"
         )
-    tried = []
+    fits = []
     for first in range(3 if len(camera_cubes) > 1 else 1):
         rough = _aligned([camera_cubes[0].relabelled(first)], machine_cubes[:1])[0]
         named = [camera_cubes[0].relabelled(first)]
@@ -152,21 +152,20 @@ def matched(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> list
             both.apply(_corners(seen)) - _corners(touched)
             for seen, touched in zip(named, machine_cubes, strict=True)
         ]
-        tried.append((float(np.sqrt(3 * np.mean(np.square(off)))), first, named))
-    tried.sort(key=lambda found: found[:2])
-    best = tried[0]
-    if best[0] > MOST_MISMATCH_MM:
+        fits.append((float(np.sqrt(3 * np.mean(np.square(off)))), first, named))
+    (mismatch, _, best), *others = sorted(fits, key=lambda fit: fit[:2])
+    if mismatch > MOST_MISMATCH_MM:
         raise InputError(
-            f"the camera's cubes and the machine's do not match: their corners stay {best[0]:.2g} "
+            f"the camera's cubes and the machine's do not match: their corners stay {mismatch:.2g} "
             "mm apart; is the order of the placements the same, and are the points of each face "
             "on that face?"
         )
-    if len(tried) > 1 and tried[1][0] < CLEARER * max(best[0], 0.05):
+    if others and others[0][0] < CLEARER * max(mismatch, 0.05):
         raise InputError(
-            f"which face of the cube is which cannot be told: two ways fit to {best[0]:.2g} and "
-            f"{tried[1][0]:.2g} mm; turn the cube between the placements"
+            f"which face of the cube is which cannot be told: two ways fit to {mismatch:.2g} and "
+            f"{others[0][0]:.2g} mm; turn the cube between the placements"
         )
-    return best[2]
+    return best
 
 
 def _corners(cube: Cube) -> np.ndarray:

@@ -150,9 +150,10 @@ def cube_of(
     """
     if len(points) != 3:
         raise InputError(f"a cube's frame needs three of its faces, got {len(points)}")
-    faces = [fit_face(some, noise_mm=noise_mm, form_mm=form_mm) for some in points]
-    for (i, one), (j, other) in itertools.combinations(enumerate(faces), 2):
-        askew = abs(float(np.degrees(np.arcsin(np.clip(one.normal @ other.normal, -1, 1)))))
+    faces = [fit_face(face, noise_mm=noise_mm, form_mm=form_mm) for face in points]
+    for i, j in itertools.combinations(range(3), 2):
+        cosine = np.clip(faces[i].normal @ faces[j].normal, -1, 1)
+        askew = abs(float(np.degrees(np.arcsin(cosine))))
         if askew > most_askew_deg:
             raise InputError(
                 f"faces {i} and {j} are {askew:.2f} deg from square, more than "
