@@ -100,6 +100,7 @@ def random_variables(pairs: Pair):
 
 
 @pytest.mark.usefixtures("_double")
+@pytest.mark.slow
 def test_the_batch_is_the_mean_of_its_pairs_in_value_and_gradient():
     """The same in plain reverse mode, one pair after another, and nothing shared."""
     pairs = batch()
