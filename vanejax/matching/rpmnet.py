@@ -27,6 +27,9 @@ import jax.numpy as jnp
 from vanejax.matching.features import point_pair_features
 from vanejax.matching.procrustes import weighted_procrustes
 from vanejax.matching.sinkhorn import sinkhorn, soft_correspondences
+from vanejax.matching.torch_weights import (
+    rpmnet_variables as variables_from_torch,  # noqa: F401  # the name in older scripts
+)
 from vanejax.pointcloud import PointCloud, ball_query
 from vanejax.rigid import RigidTransform
 from vanejax.settings import Settings, multiple_of, positive, settings_class
