@@ -24,7 +24,7 @@ from pathlib import Path
 import nbclient
 import nbformat
 from nbformat import NotebookNode
-from PIL import Image
+from PIL import Image, ImageChops
 
 from experiments.runner import study_command
 from vanejax.errors import InputError
@@ -102,7 +102,11 @@ def photograph(page: str) -> bytes:
         flags += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # WebGL without a GPU
         place = [f"--screenshot={shot}", "--window-size=900,560", path.as_uri()]
         subprocess.run([browser, *flags, *place], check=True, capture_output=True)
-        return shot.read_bytes()
+        picture = Image.open(shot).convert("RGB")
+    margins = ImageChops.difference(picture, Image.new("RGB", picture.size, "white"))
+    buffer = io.BytesIO()
+    picture.crop(margins.getbbox()).save(buffer, "PNG")
+    return buffer.getvalue()
 
 
 def small_png(picture: bytes) -> bytes:
