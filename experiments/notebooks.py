@@ -64,7 +64,7 @@ def texts(notebook: NotebookNode) -> list[str]:
     for cell in notebook.cells:
         if cell.cell_type == "code":
             parts = [out.get("text") or out.data["text/plain"] for out in cell.outputs]
-            text = re.sub(r"0x[0-9a-f]+", "#", "\n".join(parts))
+            text = re.sub(r"\n+", "\n", re.sub(r"0x[0-9a-f]+", "#", "\n".join(parts)))
             printed.append(re.sub(r"[-+]?\d[\d,.e+-]*", "#", re.sub(r" +", " ", text)))
     return printed
 
