@@ -124,6 +124,7 @@ def test_a_cloud_of_fewer_rows_than_neighbours(params, xyz):
     np.testing.assert_allclose(found, slow_dgcnn(few, params, 4), atol=EXACT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["empty", "one point", "coincident", "line"])
 def test_degenerate_clouds_have_finite_features_and_gradients(params, xyz, case):
     mask = {"empty": np.zeros(N, bool), "one point": np.arange(N) == 5}.get(case, np.ones(N, bool))

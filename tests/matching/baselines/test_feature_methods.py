@@ -49,11 +49,13 @@ def error_deg(register) -> float:
     return float(rotation_error_deg(result.target_from_source, truth))
 
 
+@pytest.mark.slow
 def test_refinement_improves_on_the_best_triple() -> None:
     rough, refined = (error_deg(sac_ia(**SAC_IA, refinements=count)) for count in (0, 10))
     assert refined < 0.7 * rough < 15
 
 
+@pytest.mark.slow
 def test_the_kernel_narrows_to_the_last_width() -> None:
     """Without graduation, the wide kernel of the start, the outliers pull the answer away."""
     everything = {"tuple_similarity": 0.0, "max_normal_angle": 3.2}
