@@ -172,12 +172,12 @@ def _scene_triangles(data: bytes, path: Path, suffix: str) -> tuple[np.ndarray, 
             f"{path}: truncated: it promises {counts['face']:,} faces and holds "
             f"{len(meshes[0][1].faces):,}; copy or export it again"
         )
-    all_vertices, all_faces, start = [], [], 0
-    for matrix, mesh in meshes:
-        all_vertices.append(np.asarray(mesh.vertices) @ matrix[:3, :3].T + matrix[None, :3, 3])
-        all_faces.append(np.asarray(mesh.faces, np.int64) + start)
-        start += len(mesh.vertices)
-    return np.concatenate(all_vertices), np.concatenate(all_faces)
+    vertices = [np.asarray(mesh.vertices) @ m[:3, :3].T + m[None, :3, 3] for m, mesh in meshes]
+    first = np.cumsum([0, *map(len, vertices[:-1])])
+    faces = [
+        np.asarray(mesh.faces, np.int64) + i for i, (_, mesh) in zip(first, meshes, strict=True)
+    ]
+    return np.concatenate(vertices), np.concatenate(faces)
 
 
 def _ply_counts(data: bytes, path: Path) -> dict[str, int]:

@@ -1,9 +1,7 @@
 """The nearest point of a part's surface, exactly, whatever the size and shape of its faces.
 
-`vanejax.cad.surface.Surface.exact` looks at the faces of a few samples near by. That is quick and
-right
-to a face's size; on the long thin faces of a flat side it can be off by a millimetre. Where a part
-is measured and not registered, the nearest face of all is wanted.
+`Surface.exact` looks at the faces of a few samples near by: quick, and right to a face's size,
+which on the long thin faces of a flat side can be a millimetre.
 """
 
 from __future__ import annotations
@@ -51,15 +49,10 @@ class NearestFace:
         Where several faces share one, at an edge or a corner, that which faces the point or turns
         from it most: the side of that face is the side of the solid.
         """
-        blocks = [
-            self._nearest_of(points[first : first + PAIRS_AT_ONCE // FIRST_FACES])
-            for first in range(0, len(points), PAIRS_AT_ONCE // FIRST_FACES)
-        ]
-        return ClosestPoints(
-            np.concatenate([closest.points for closest in blocks]),
-            np.concatenate([closest.normals for closest in blocks]),
-            np.concatenate([closest.face for closest in blocks]),
-        )
+        size = PAIRS_AT_ONCE // FIRST_FACES
+        blocks = [self._nearest_of(points[i : i + size]) for i in range(0, len(points), size)]
+        columns = zip(*((b.points, b.normals, b.face) for b in blocks), strict=True)
+        return ClosestPoints(*map(np.concatenate, columns))
 
     def _nearest_of(self, points: np.ndarray) -> ClosestPoints:
         best = np.full(len(points), np.inf)

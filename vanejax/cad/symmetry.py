@@ -22,6 +22,7 @@ SURFACE_SAMPLES, SAMPLES_PER_QUERY = 60_000, 3
 SCREENED_POINTS, POLISHED_POINTS, SCORED_POINTS = 150, 400, 2000
 POLISHING_STEPS = 6
 SAME_TURN_DEG, SAME_SHIFT = 10.0, 0.1  # of the radius: what counts as one near symmetry
+LARGEST_SHARE = 0.02  # of the radius, what the mean surface distance of a near one may reach
 
 
 def rotation_about(axis: np.ndarray, angle_deg: float, point: np.ndarray) -> np.ndarray:
@@ -129,7 +130,6 @@ def near_symmetries(
     symmetries: np.ndarray,
     *,
     continuous_axis: Axis | None = None,
-    largest_share: float = 0.02,
     more: np.ndarray | None = None,
 ) -> np.ndarray:
     """Motions that nearly map the part to itself, found numerically.
@@ -142,13 +142,12 @@ def near_symmetries(
       part: whose.
       symmetries: [S, 4, 4], the exact ones, identity included.
       continuous_axis: point and direction of an axis of exact continuous symmetry.
-      largest_share: of the part's radius, what the mean surface distance may reach.
       more: [K, 4, 4] further motions to try.
 
     Returns:
       Motions [M, 4, 4], by ascending symmetric mean surface distance.
     """
-    surface, limit = DenseSurface(part), largest_share * part.radius
+    surface, limit = DenseSurface(part), LARGEST_SHARE * part.radius
     near: list[tuple[float, np.ndarray]] = []
     tried: list[np.ndarray] = []
 

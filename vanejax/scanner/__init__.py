@@ -1,9 +1,8 @@
 """From a `Part` and a camera's pose to what a structured-light camera measures.
 
 In: a part, a `Camera`, poses ``camera_from_part``. Out: an ideal `Scan` (Embree rays,
-self-occlusion,
-normals, face ids), or with a `Sensor` a `Measurement`: points with errors, and the reason of each
-lost pixel.
+self-occlusion, normals, face ids), or with a `Sensor` a `Measurement`: points with errors, and the
+reason of each lost pixel.
 """
 
 from vanejax.scanner.camera import Camera, Viewpoints, hemisphere_viewpoints, look_at

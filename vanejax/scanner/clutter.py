@@ -27,12 +27,7 @@ _RINGS, _SPOKES = 5, 16  # of a drop
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ClutterObject:
-    """A thing that is not the part.
-
-    Attributes:
-      kind: ``"table"``, ``"clamp"``, ``"chip"`` or ``"drop"``.
-      mesh: closed surface with outward faces, mm, part frame.
-    """
+    """A table, clamp, chip or drop (its kind), and its closed, outward mesh in mm, part frame."""
 
     kind: str
     mesh: trimesh.Trimesh
@@ -40,12 +35,7 @@ class ClutterObject:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ClutterScene:
-    """A part and what is around it.
-
-    Attributes:
-      part: whose pose is asked for.
-      objects: what else is seen.
-    """
+    """The part whose pose is asked for, and what else is seen."""
 
     part: Part
     objects: tuple[ClutterObject, ...] = ()
@@ -215,11 +205,8 @@ def coolant_drops(
     for place, normal in zip(*_places(below, part, rng, count), strict=True):
         cap = _cap(rng.uniform(1, 5), math.radians(rng.uniform(20, 70)))
         turn = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0]
-        drops.append(
-            ClutterObject(
-                "drop", trimesh.Trimesh(turn.apply(cap) + place, _cap_faces(), process=False)
-            )
-        )
+        mesh = trimesh.Trimesh(turn.apply(cap) + place, _cap_faces(), process=False)
+        drops.append(ClutterObject("drop", mesh))
     return tuple(drops)
 
 
@@ -286,13 +273,8 @@ def _cap(radius: float, contact: float) -> np.ndarray:
     circle = np.stack([np.cos(spoke), np.sin(spoke)], axis=-1)
     out = np.append(sphere * np.sin(polar), radius)
     up = np.append(sphere * (np.cos(polar) - math.cos(contact)), -0.3 * radius)
-    rings = np.concatenate(
-        [
-            out[:, None, None] * circle,
-            np.broadcast_to(up[:, None, None], (_RINGS + 1, _SPOKES, 1)),
-        ],
-        axis=-1,
-    )
+    heights = np.broadcast_to(up[:, None, None], (_RINGS + 1, _SPOKES, 1))
+    rings = np.concatenate([out[:, None, None] * circle, heights], axis=-1)
     ends = [[0.0, 0.0, sphere * (1 - math.cos(contact))], [0.0, 0.0, up[-1]]]
     return np.concatenate([rings.reshape(-1, 3), ends])
 
@@ -303,11 +285,6 @@ def _cap_faces() -> np.ndarray:
     ring = np.arange(_SPOKES)
     after = (ring + 1) % _SPOKES
     last = _RINGS * _SPOKES
-    top = np.full(_SPOKES, (_RINGS + 1) * _SPOKES)
-    return np.concatenate(
-        [
-            _tube_faces(_RINGS + 1, _SPOKES),
-            np.stack([top, ring, after], axis=1),
-            np.stack([top + 1, last + after, last + ring], axis=1),
-        ]
-    )
+    top = np.full(_SPOKES, last + _SPOKES)
+    ends = [[top, ring, after], [top + 1, last + after, last + ring]]
+    return np.concatenate([_tube_faces(_RINGS + 1, _SPOKES), *np.swapaxes(ends, 1, 2)])

@@ -1,14 +1,9 @@
 """Embree's answers to two questions: which triangle a ray meets first, and whether a way is free.
 
-Only this file knows embreex. What embreex would otherwise do to its callers, and what is done:
-
-* everything is float32: callers centre the scene on the part and start rays just in front of it,
-  and Embree says only *which* triangle is hit; its distances are not read;
-* a miss is triangle -1 at distance 1e37, normals are not unit vectors, distances are in lengths
-  of the direction vector, and a ``dists`` array is overwritten in place: the array given is
-  always a fresh one;
-* the scene is built on the first query, which is not safe from two threads: the constructor asks
-  one. After that queries release the GIL, so threads share one scene.
+Only this file knows embreex. Everything in it is float32: callers centre the scene on the part and
+start rays just in front of it, and distances are not read. It overwrites a ``dists`` array, so it
+is given a fresh one, and it builds the scene on the first query, which is not safe from two
+threads: the constructor asks one. Later queries release the GIL, so threads share one scene.
 """
 
 from __future__ import annotations

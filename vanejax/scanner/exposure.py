@@ -117,5 +117,4 @@ class Exposure:
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[N] dot products of rows."""
     return np.einsum("ni,ni->n", a, b)

@@ -73,11 +73,6 @@ class Measurement:
         return np.linalg.norm(self.points.astype(np.float64), axis=-1).astype(np.float32)
 
     @property
-    def clean_range_mm(self) -> np.ndarray:
-        """[n] f32, mm from the camera, of the ideal scan."""
-        return self.ideal.range_mm[self.kept]
-
-    @property
     def hole_share(self) -> float:
         """Share of the N pixels that are not measured."""
         return 1 - len(self.kept) / max(1, len(self.reason))
@@ -109,23 +104,14 @@ class Measurement:
 def measure(
     scanner: Scanner, sensor: Sensor, camera_from_part: RigidTransform, rng: np.random.Generator
 ) -> Measurement:
-    """One scan of the part by a sensor: `Scanner.scan`, then `sensed`.
+    """One scan of the part by a sensor: `Scanner.scan`, then what the sensor makes of it.
+
+    The same state of ``rng`` gives the same bits.
 
     Raises:
       InputError: no pixel sees the part.
     """
-    return sensed(scanner, scanner.scan(sensor.camera, camera_from_part), sensor, rng)
-
-
-def sensed(scanner: Scanner, scan: Scan, sensor: Sensor, rng: np.random.Generator) -> Measurement:
-    """What a sensor makes of an ideal scan by its own camera.
-
-    Args:
-      scanner: that made the scan: it casts the shadows.
-      scan: N pixels.
-      sensor: whose camera made it.
-      rng: of all that is random; the same state gives the same bits.
-    """
+    scan = scanner.scan(sensor.camera, camera_from_part)
     view = SensedView(scanner, scan, sensor, rng)
     reason = np.zeros(len(scan.points), np.uint8)
     for why, dropout in DROPOUTS:

@@ -102,11 +102,8 @@ def _spline(count: int, length_px: float) -> np.ndarray:
     place = np.arange(count) / length_px
     knots = np.arange(int(place[-1]) + 4) - 1
     distance = np.abs(place[:, None] - knots[None, :])
-    weight = np.where(
-        distance < 1,
-        2 / 3 - distance**2 + distance**3 / 2,
-        np.maximum(2 - distance, 0) ** 3 / 6,
-    )
+    inner = 2 / 3 - distance**2 + distance**3 / 2
+    weight = np.where(distance < 1, inner, np.maximum(2 - distance, 0) ** 3 / 6)
     weight /= np.linalg.norm(weight, axis=1, keepdims=True)
     return weight.astype(np.float32)
 
@@ -198,13 +195,13 @@ def flying_pixel_errors(
     *,
     rate: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What pixels at depth edges measure: some of the surface beside their own.
+    """What pixels at depth edges measure of the surface beside their own.
 
     A pixel that an edge crosses sees both sides, and its own for the larger part: the other's
     weight is uniform up to one half.
 
     Args:
-      rng: source of randomness.
+      rng: of what is drawn.
       sides: [J] each, from `depth_jumps`.
       disparity: [N] pixels.
       rate: share of the edges at which a pixel is mixed.

@@ -181,11 +181,6 @@ class Sensor:
         return dataclasses.replace(self, **changes)
 
 
-def ideal() -> Sensor:
-    """The paper's virtual camera: a z-buffer."""
-    return Sensor()
-
-
 def paper_camera() -> Sensor:
     """The structured-light camera of the paper's Table 2, good to 0.1 mm at 300 and 1 at 1300 mm.
 
@@ -247,7 +242,7 @@ def consumer_depth() -> Sensor:
     )
 
 
-PRESETS = {"ideal": ideal, "paper_camera": paper_camera, "consumer_depth": consumer_depth}
+PRESETS = {"ideal": Sensor, "paper_camera": paper_camera, "consumer_depth": consumer_depth}
 
 
 def preset(name: str) -> Sensor:

@@ -108,13 +108,9 @@ def clean_scan(
     if np.count_nonzero(zero) > 1:
         points, normals = _without(points, normals, zero, "without a measurement (0, 0, 0)", notes)
     normals, bad = _unit_normals(normals, notes)
-    if bad is not None:
-        points, normals = _without(
-            points, normals, bad, "whose normal is zero or not finite", notes
-        )
+    points, normals = _without(points, normals, bad, "whose normal is zero or not finite", notes)
     double = repeats(points)
-    if double is not None:
-        points, normals = _without(points, normals, double, "that repeat another exactly", notes)
+    points, normals = _without(points, normals, double, "that repeat another exactly", notes)
     if len(points) < MIN_POINTS:
         dropped = f" ({'; '.join(notes)})" if notes else ""
         raise InputError(
@@ -150,10 +146,14 @@ def at_place(points: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def _without(
-    points: np.ndarray, normals: np.ndarray | None, bad: np.ndarray, why: str, notes: list[str]
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    bad: np.ndarray | None,
+    why: str,
+    notes: list[str],
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points and normals without the ``bad`` [N] bool, and a note that says so."""
-    count = int(np.count_nonzero(bad))
+    """Points and normals without the ``bad`` [N] bool (None: none), and a note that says so."""
+    count = 0 if bad is None else int(np.count_nonzero(bad))
     if not count:
         return points, normals
     notes.append(f"dropped {count:,} points {why}")

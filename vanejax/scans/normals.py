@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,25 +21,6 @@ _LINE = 1e-4
 _LUMP = 0.25
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class LocalPlanes:
-    """What the neighbourhoods of n points say.
-
-    Attributes:
-      normals: [n, 3] f32, unit.
-      reliable: [n] bool; False where the neighbours lie on a line, at one place, or are a lump.
-      roughness_mm: [n] f32, rms distance of the neighbours from their plane: noise and curvature.
-      tilt_deg: [n] f32, standard error of the normal's direction if the roughness is white noise.
-      num_neighbors: K, the point itself included.
-    """
-
-    normals: np.ndarray
-    reliable: np.ndarray
-    roughness_mm: np.ndarray
-    tilt_deg: np.ndarray
-    num_neighbors: int
-
-
 def estimate_normals(
     points: np.ndarray,
     *,
@@ -49,19 +28,7 @@ def estimate_normals(
     num_neighbors: int | None = None,
     at: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Unit normals [n, 3] f32 of a cloud; see `local_planes` for what is known of their quality."""
-    planes = local_planes(points, sensor_origin=sensor_origin, num_neighbors=num_neighbors, at=at)
-    return planes.normals
-
-
-def local_planes(
-    points: np.ndarray,
-    *,
-    sensor_origin: np.ndarray | None,
-    num_neighbors: int | None = None,
-    at: np.ndarray | None = None,
-) -> LocalPlanes:
-    """Planes through the neighbours of points: principal components (Hoppe et al. 1992).
+    """Unit normals [n, 3] f32 of a cloud: principal components of neighbours (Hoppe et al. 1992).
 
     Normals face the sensor. Where its place is unknown they face away from the mean of all points,
     which is outward on a convex part only: do not trust their sign then. Of clouds with more than
@@ -90,7 +57,8 @@ def local_planes(
     if num_neighbors is not None and num_neighbors < 3:
         raise InputError(f"num_neighbors must be at least 3, a plane's points, got {num_neighbors}")
     at = np.arange(len(points)) if at is None else np.asarray(at)
-    if at.ndim != 1 or (at.size and (at.dtype.kind not in "iu" or _outside(at, len(points)))):
+    outside = at.size and (at.dtype.kind not in "iu" or at.min() < 0 or at.max() >= len(points))
+    if at.ndim != 1 or outside:
         raise InputError(f"at must hold indices below {len(points)}, got {at.dtype} {at.shape}")
     queries = points[at.astype(np.int64)].astype(np.float64)
     cloud = _thinned(points).astype(np.float64)
@@ -102,16 +70,10 @@ def local_planes(
     tree = cKDTree(cloud, balanced_tree=False, compact_nodes=False)
     if num_neighbors is None:
         num_neighbors = _enough_neighbors(tree, cloud)
-    parts = [
-        _planes_at(tree, cloud, queries[i : i + _BLOCK], sides[i : i + _BLOCK], num_neighbors)
-        for i in range(0, len(queries), _BLOCK)
-    ] or [_planes_at(tree, cloud, queries, sides, num_neighbors)]
-    normals, reliable, roughness, tilt = (np.concatenate(p) for p in zip(*parts, strict=True))
-    return LocalPlanes(normals, reliable, roughness, np.degrees(tilt), num_neighbors)
-
-
-def _outside(at: np.ndarray, count: int) -> bool:
-    return bool(at.min() < 0 or at.max() >= count)
+    blocks = [slice(i, i + _BLOCK) for i in range(0, max(len(queries), 1), _BLOCK)]
+    return np.concatenate(
+        [_planes_at(tree, cloud, queries[b], sides[b], num_neighbors)[0] for b in blocks]
+    )
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:
@@ -135,7 +97,7 @@ def _enough_neighbors(tree: cKDTree, cloud: np.ndarray) -> int:
     for count in NEIGHBOR_CHOICES:
         if tilts and count > len(cloud) // 4:  # no longer a neighbourhood
             break
-        _, reliable, _, tilt = _planes_at(tree, cloud, queries, np.ones_like(queries), count)
+        _, reliable, tilt = _planes_at(tree, cloud, queries, np.ones_like(queries), count)
         tilts[count] = np.degrees(np.median(tilt[reliable])) if reliable.any() else np.inf
         if tilts[count] < _WANTED_TILT_DEG:
             return count
@@ -145,7 +107,7 @@ def _enough_neighbors(tree: cKDTree, cloud: np.ndarray) -> int:
 def _planes_at(
     tree: cKDTree, cloud: np.ndarray, queries: np.ndarray, sides: np.ndarray, num_neighbors: int
 ) -> tuple[np.ndarray, ...]:
-    """Normals [n, 3], reliable [n], roughness [n] mm and tilt [n] rad at n <= _BLOCK queries."""
+    """What `_fit_planes` says, [n, ...] each, at n <= _BLOCK queries."""
     size = _SMALL_BLOCK if len(queries) <= _SMALL_BLOCK else _BLOCK
     count = min(num_neighbors, len(cloud))
     offsets = np.zeros((size, num_neighbors, 3), np.float32)
@@ -161,7 +123,7 @@ def _planes_at(
 @jax.jit
 def _fit_planes(
     offsets: jax.Array, mask: jax.Array, toward: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Planes through B neighbourhoods of K points.
 
     Args:
@@ -170,9 +132,9 @@ def _fit_planes(
       toward: [B, 3], the side to which the normals are to point.
 
     Returns:
-      normals [B, 3]; reliable [B]; rms distance from the plane [B]; standard error of the normal's
-      direction in its worse axis [B], rad: of n points with variances a < b < c along the axes,
-      sqrt(a / (n b)).
+      normals [B, 3]; reliable [B], False where the neighbours lie on a line, at one place, or are
+      a lump; standard error of the normal's direction in its worse axis [B], rad: of n points with
+      variances a < b < c along the axes, sqrt(a / (n b)).
     """
     mask = mask[None, :, None]
     number = jnp.sum(mask)
@@ -191,4 +153,4 @@ def _fit_planes(
     reliable = (variance[:, 1] > _LINE * variance[:, 2]) & (variance[:, 0] < _LUMP * variance[:, 1])
     across = jnp.where(variance[:, 1] > 0, variance[:, 1], 1.0)
     tilt = jnp.sqrt(variance[:, 0] / (number * across))
-    return normals, reliable, jnp.sqrt(variance[:, 0]) * size, tilt
+    return normals, reliable, tilt

@@ -104,9 +104,8 @@ def _fields(header: dict[str, list[str]], path: Path) -> list[Field]:
         ) from error
     points, normals = wanted_columns(names, path)
     wrong = [f"{f.name} {f.count}" for f in fields if not 0 < f.count < 2**16]
-    wrong += [
-        f"{fields[i].name} {fields[i].count}" for i in points + normals if fields[i].count > 1
-    ]
+    several = (fields[i] for i in points + normals if fields[i].count > 1)
+    wrong += [f"{f.name} {f.count}" for f in several]
     if wrong:
         raise InputError(f"{path}: COUNT of its header makes no sense: {', '.join(wrong[:12])}")
     return fields

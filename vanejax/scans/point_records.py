@@ -73,14 +73,7 @@ def wanted_columns(names: Sequence[str], path: Path) -> tuple[list[int], list[in
     """
     lower = [name.lower() for name in names]
     points, normals = (
-        next(
-            (
-                [lower.index(name) for name in choice]
-                for choice in choices
-                if set(choice) <= set(lower)
-            ),
-            [],
-        )
+        next(([lower.index(n) for n in group] for group in choices if set(group) <= set(lower)), [])
         for choices in (POINT_NAMES, NORMAL_NAMES)
     )
     if not points:
@@ -92,12 +85,9 @@ def wanted_columns(names: Sequence[str], path: Path) -> tuple[list[int], list[in
 
 
 def check_count(path: Path, count: int, bytes_per_point: int, held: int) -> None:
-    """Refuses a promised number of points that is zero, too large, or not there.
+    """Refuses, by InputError, a promised number of points that is zero, too large, or not there.
 
     A point takes ``bytes_per_point`` at least, and the file has ``held`` bytes after its header.
-
-    Raises:
-      InputError: see above.
     """
     if count < 1:
         raise InputError(f"{path}: holds no points; export the scan again")
@@ -207,12 +197,9 @@ def split_columns(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def refuse_rest(file: BinaryIO, bytes_per_point: int, path: Path) -> None:
-    """Refuses a file that goes on after its last point: the count in its header is too small.
+    """Refuses, by InputError, a file that goes on after its last point.
 
     Fewer bytes than a point takes, and padding with zeros or white space, are no points.
-
-    Raises:
-      InputError: see above.
     """
     rest = file.read(1 << 20)
     if len(rest) >= bytes_per_point and rest.strip(b"\0 \t\r\n"):

@@ -12,13 +12,7 @@ def robust_sigma(
 ) -> np.ndarray:
     """1.4826 times the median of |deviation|: of normal ones the standard deviation about zero.
 
-    Args:
-      deviations: of any shape and unit, from what they should be.
-      axis: over which the median is taken; default all.
-      ignore_nan: takes the median of those that are not NaN.
-
-    Returns:
-      f64, of the shape without ``axis``, in the deviations' unit.
+    Of any shape and unit; f64, over ``axis`` (default all), without NaN if ``ignore_nan``.
     """
     median = np.nanmedian if ignore_nan else np.median
     return MAD_TO_SIGMA * median(np.abs(deviations), axis=axis)

@@ -92,20 +92,13 @@ def _millimetres(
 ) -> tuple[float, tuple[str, ...]]:
     """Millimetres per unit of the file, and what is to be said about it.
 
-    Args:
-      size: robust extent of the cloud, in the file's unit.
-      units: as given to `load_scan`.
-      diagonal: of the part, mm; None if unknown.
-      path: for messages.
+    From the cloud's `robust_extent` in that unit and the part's diagonal in mm.
     """
     if not size or (diagonal is None and units != "auto"):
         return MM_PER_UNIT.get(units, 1.0), ()
     if diagonal is None:
-        if size < _METRES_BELOW:
-            return 1.0, (
-                f"taken as millimetres, {size:.3g} mm large: if that is wrong, it is in metres",
-            )
-        return 1.0, ()
+        note = f"taken as millimetres, {size:.3g} mm large: if that is wrong, it is in metres"
+        return 1.0, (note,) if size < _METRES_BELOW else ()
     fits = lambda unit: _SMALLEST <= size * MM_PER_UNIT[unit] / diagonal <= _LARGEST  # noqa: E731
     if units == "auto":
         if fits("mm"):

@@ -44,12 +44,7 @@ class Segment(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Segments:
-    """A scan of N points, taken apart.
-
-    Attributes:
-      label: [N] u8, a `Segment` each.
-      tables: the planes that were taken away.
-    """
+    """A scan of N points, taken apart: a `Segment` each [N] u8, and the planes taken away."""
 
     label: np.ndarray
     tables: tuple[Plane, ...]
@@ -147,9 +142,8 @@ def _part_of(
     small = np.setdiff1d(order, large)
     fits = np.all(supports.widths(main_piece)[small] <= np.maximum(allowed, main_piece.widths()), 1)
     if tables:
-        height = np.min(
-            [table.height_mm(voxels.middle) - table.thickness_mm for table in tables], 0
-        )
+        above = [table.height_mm(voxels.middle) - table.thickness_mm for table in tables]
+        height = np.min(above, axis=0)
         lowest = np.full(len(order), np.inf)
         np.minimum.at(lowest, piece, height)
         fits &= lowest[small] > 2 * size_mm

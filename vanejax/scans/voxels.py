@@ -102,9 +102,8 @@ class Voxels:
     def _normals(self, sensor_origin: np.ndarray) -> np.ndarray:
         """[V, 3] f64 unit, of the plane through a voxel and its neighbours, to the sensor."""
         first, second = self.neighbors
-        near = sparse.coo_matrix(
-            (np.ones(len(first)), (first, second)), shape=(len(self), len(self))
-        ).tocsr()
+        pairs = np.ones(len(first)), (first, second)
+        near = sparse.csr_matrix(pairs, shape=(len(self), len(self)))
         about = self.middle - self.middle.mean(axis=0)
         products = about[:, :, None] * about[:, None]
         sums = np.column_stack([np.ones(len(self)), about, products.reshape(-1, 9)])
