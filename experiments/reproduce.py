@@ -26,7 +26,7 @@ from experiments.pages.reproduction.page import to_page
 from experiments.pages.reproduction.run import estimate, measured, outcomes_json, run_studies
 from experiments.pages.reproduction.studies import ROOT, Outcome, chosen, recorded
 from experiments.runner import study_command as study
-from vanejax.cad.parametric_vane import guide_vane
+from vanejax.cad import guide_vane
 from vanejax.errors import InputError
 from vanejax.files import check_writable, write_text
 from vanejax.training.pretrained import PRETRAINED, find_weights

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
-from vanejax.matching.rpmnet import RpmNet
+from vanejax.matching import RpmNet
 
 ANNEALING_POINTS = (4, 64, 64, 64, 128, 1024)  # widths of the net before its maximum
 ANNEALING_CLOUD = (1024, 512, 256, 2)  # and behind it

@@ -15,7 +15,7 @@ from experiments.runner import machine
 from vanejax.matching import fast_rpmnet
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
-from vanejax.training.pairs import Pair
+from vanejax.training import Pair
 
 TEST_ITERATIONS = 5
 

@@ -17,7 +17,7 @@ from experiments.benchmarks.timing import Bench, Figure
 from vanejax.errors import InputError
 from vanejax.files import write_json
 from vanejax.machine.pose_file import pose_to_dict
-from vanejax.scans.scan_file import save_points
+from vanejax.scans import save_points
 
 T = TypeVar("T")
 

@@ -12,9 +12,8 @@ from embreex.rtcore_scene import EmbreeScene
 
 from experiments.benchmarks.peers import OPEN3D_ICP, SMALL_GICP, open3d_icp, small_gicp_icp
 from experiments.benchmarks.timing import Bench, Figure
-from vanejax.cad.part import Part
-from vanejax.localization.fine_registration import refine
-from vanejax.localization.registration import register
+from vanejax.cad import Part
+from vanejax.localization import refine, register
 from vanejax.localization.residuals import Precision, RayCasting, Residuals
 from vanejax.rigid import RigidTransform
 

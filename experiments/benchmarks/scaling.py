@@ -18,12 +18,10 @@ from experiments.benchmarks.timing import NOISE_MM, Bench, shown
 from experiments.benchmarks.vane_pairs import VanePairs
 from experiments.runner import study_command as study
 from experiments.runner.vane_views import VaneViews, with_noise
-from vanejax.cad.part import Part, load_part
-from vanejax.localization.fine_registration import refine
-from vanejax.localization.registration import register
-from vanejax.scanner.virtual_scanner import Scanner
-from vanejax.scans.measured_scan import MeasuredScan
-from vanejax.scans.scan_file import load_scan, save_points
+from vanejax.cad import Part, load_part
+from vanejax.localization import refine, register
+from vanejax.scanner import Scanner
+from vanejax.scans import MeasuredScan, load_scan, save_points
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,10 +11,9 @@ from embreex.rtcore_scene import EmbreeScene
 from experiments.benchmarks.registration import bare_scene
 from experiments.benchmarks.timing import Bench, Figure, peer
 from experiments.runner import machine
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera
-from vanejax.scanner.viewpoint_scans import scan_views
+from vanejax.scanner import Camera, scan_views
 
 SAMPLE = 9  # every ninth view stands for all: four azimuths of each elevation
 STRIPS = (1 << 12, 1 << 14, 1 << 16)  # rays given to Embree at once; the fastest counts

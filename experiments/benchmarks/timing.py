@@ -14,9 +14,8 @@ import numpy as np
 from experiments.runner import study_command as study
 from experiments.runner.vane_views import VaneViews, magnitudes, perturb, pose_error, with_noise
 from vanejax.rigid import RigidTransform
-from vanejax.scans.measured_scan import MeasuredScan
-from vanejax.training.pretrained import find_weights
-from vanejax.training.weight_file import TrainedMatcher
+from vanejax.scans import MeasuredScan
+from vanejax.training import TrainedMatcher, find_weights
 
 NOISE_MM, START_DEG, START_MM = 0.1, 5.0, 5.0
 LONG_S = 10.0  # from here on cold caches hardly count

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 
 from experiments.configs.vane import get_config
 from experiments.runner.experiment import Experiment
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.training.dataset import ScanSet, make_scan_set
+from vanejax.cad import guide_vane
+from vanejax.scanner import Camera, hemisphere_viewpoints
+from vanejax.training import ScanSet, make_scan_set
 from vanejax.training.pairs import Pair, PairSampling, ScanBank, draw_pairs, make_bank
 from vanejax.training.train_step import TrainState, init_state, make_optimizer, make_train_step
 

@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from vanejax.cad.part import part_from_mesh
+from vanejax.cad import part_from_mesh
 from vanejax.localization.pose_result import PointStatus
 from vanejax.plotting import deviation_map, overlay_before_after, residual_histogram
 from vanejax.plotting.deviation import (
@@ -23,7 +23,7 @@ from vanejax.plotting.deviation import (
 )
 from vanejax.plotting.scene import Picture, Scene, reader_rotation, scale_bar_mm
 from vanejax.rigid import RigidTransform
-from vanejax.scans.measured_scan import MeasuredScan
+from vanejax.scans import MeasuredScan
 
 HALF = np.array([30.0, 20.0, 10.0])
 BLUE = np.array([[0.0, 0.0, 1.0]])

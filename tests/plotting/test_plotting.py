@@ -17,14 +17,12 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from vanejax import plotting
-from vanejax.cad.part import part_from_mesh
+from vanejax.cad import part_from_mesh
 from vanejax.errors import InputError
 from vanejax.plotting.canvas import CAD, SCAN
 from vanejax.plotting.clouds import seen_and_hidden
 from vanejax.plotting.shading import crop
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.ideal_scan import Scan
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Camera, Scan, Scanner, hemisphere_viewpoints
 
 CAMERA = Camera().scaled(0.1)
 HALF_SIZES = np.array([40.0, 30.0, 20.0])

@@ -20,14 +20,14 @@ from headless_browser import CHROMIUM, HeadlessBrowser
 from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation
 
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.plotting.canvas import SCAN
 from vanejax.report import write_report
 from vanejax.report.viewer import MAX_POINTS, simplified, viewer
 from vanejax.report.wording import degrees, direction, fixed, millimetres, percent
 from vanejax.rigid import RigidTransform
-from vanejax.scans.measured_scan import MeasuredScan
+from vanejax.scans import MeasuredScan
 
 EVIL = "</script><script>document.title='owned'</script>\"'><img src=x onerror=alert(1)>&amp;"
 

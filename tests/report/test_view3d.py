@@ -15,14 +15,12 @@ from example_registration import example_registration
 from headless_browser import CHROMIUM, HeadlessBrowser
 from matplotlib.colors import to_rgb
 
-from vanejax.cad.parametric_vane import guide_vane
+from vanejax.cad import guide_vane
 from vanejax.errors import InputError
 from vanejax.plotting.canvas import HIDDEN, SCAN
 from vanejax.plotting.clouds import seen_and_hidden
-from vanejax.report.view3d import View3d, pose_view, scan_view
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.ideal_scan import Scan
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.report import View3d, pose_view, scan_view
+from vanejax.scanner import Camera, Scan, Scanner, hemisphere_viewpoints
 
 PART = guide_vane()
 VIEW = hemisphere_viewpoints(PART.center).view(53)

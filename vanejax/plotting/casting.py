@@ -8,7 +8,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.plotting.canvas import (
     DEVIATION_COLORMAP,
     ERROR_COLORMAP,
@@ -20,9 +20,7 @@ from vanejax.plotting.canvas import (
     new_figure,
 )
 from vanejax.plotting.shading import crop, draw_part, shade
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.ideal_scan import Scan
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Camera, Scan, Scanner, hemisphere_viewpoints
 
 _PIXELS = 900
 _FIELD_DEG = 12.0  # from so far away a millimetre is nearly as long everywhere

@@ -28,8 +28,7 @@ from vanejax.plotting.canvas import (
     new_figure,
 )
 from vanejax.pointcloud import voxel_thin
-from vanejax.scanner.camera import look_at
-from vanejax.scanner.ideal_scan import Scan
+from vanejax.scanner import Scan, look_at
 
 # Where the reader stands, as a viewpoint of the hemisphere: oblique enough to see a tilt.
 READER_ELEVATION_DEG = 50.0

@@ -8,7 +8,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.localization.pose_result import PointStatus, PoseResult, Verification
 from vanejax.plotting.canvas import (
     CAD,
@@ -26,7 +26,7 @@ from vanejax.plotting.canvas import (
 )
 from vanejax.plotting.scene import Picture, Scene, reader_rotation, show
 from vanejax.rigid import RigidTransform
-from vanejax.scans.measured_scan import MeasuredScan
+from vanejax.scans import MeasuredScan
 
 STATUS_COLORS = {
     PointStatus.INLIER: SCAN,

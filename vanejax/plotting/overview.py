@@ -30,8 +30,7 @@ from vanejax.plotting.clouds import (
     view_dots,
 )
 from vanejax.plotting.shading import crop, draw_part, shade
-from vanejax.scanner.camera import Camera
-from vanejax.scanner.ideal_scan import Scan
+from vanejax.scanner import Camera, Scan
 
 _GAP_IN = 0.3
 

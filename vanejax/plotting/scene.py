@@ -15,15 +15,13 @@ from matplotlib.colors import to_rgb
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.plotting.canvas import INK, TICK_PT
 from vanejax.plotting.clouds import READER_AZIMUTH_DEG, READER_ELEVATION_DEG
 from vanejax.plotting.shading import shade
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera, look_at
-from vanejax.scanner.ideal_scan import Scan
-from vanejax.scanner.virtual_scanner import Scanner
-from vanejax.scans.measured_scan import MeasuredScan
+from vanejax.scanner import Camera, Scan, Scanner, look_at
+from vanejax.scans import MeasuredScan
 
 PART_METAL = "#b4bcc8"
 # part radii: a guess may be metres away, and would leave a picture of nothing

@@ -19,10 +19,9 @@ from vanejax.plotting.canvas import (
     new_figure,
 )
 from vanejax.plotting.shading import shade
-from vanejax.scanner.camera import Camera
+from vanejax.scanner import Camera, Scan
 from vanejax.scanner.clutter import ClutterScene
-from vanejax.scanner.ideal_scan import Scan
-from vanejax.scans.segmentation import Segment, Segments
+from vanejax.scans import Segment, Segments
 
 _COLORS = {Segment.PART: SCAN, Segment.TABLE: TABLE, Segment.OTHER: CLUTTER}
 _NAMES = {Segment.PART: "part", Segment.TABLE: "table", Segment.OTHER: "clutter"}

@@ -23,7 +23,7 @@ from vanejax.plotting.canvas import (
     new_figure,
 )
 from vanejax.plotting.shading import crop
-from vanejax.scanner.measurement import Measurement, Reason
+from vanejax.scanner import Measurement, Reason
 
 REASON_COLORS = {
     Reason.SHADOWED: INK,

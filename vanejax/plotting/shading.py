@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 
 from vanejax.errors import InputError
 from vanejax.plotting.canvas import new_figure
-from vanejax.scanner.camera import Camera
-from vanejax.scanner.ideal_scan import Scan
+from vanejax.scanner import Camera, Scan
 
 _METAL = np.array([0.63, 0.68, 0.74])
 _BACKGROUND = np.array([1.0, 1.0, 1.0])

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.files import write_text
 from vanejax.localization.pose_result import Alternative, PointStatus, PoseResult, Uncertainty
@@ -41,7 +41,7 @@ from vanejax.report.wording import (
     significant,
 )
 from vanejax.rigid import RigidTransform
-from vanejax.scans.measured_scan import MeasuredScan
+from vanejax.scans import MeasuredScan
 
 _PACKAGES = ("vanejax", "jax", "numpy", "scipy", "embreex", "trimesh")
 _MOST_PICTURES = 6

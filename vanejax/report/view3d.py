@@ -18,10 +18,10 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation
 
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.files import write_text
-from vanejax.localization.pose_result import PoseResult
+from vanejax.localization import PoseResult
 from vanejax.plotting.canvas import HIDDEN, SCAN
 from vanejax.plotting.clouds import seen_and_hidden
 from vanejax.plotting.deviation import color_limit_mm
@@ -30,8 +30,8 @@ from vanejax.report.templates import source, templates
 from vanejax.report.viewer import MAX_POINTS, scene_json, simplified, spacing_mm
 from vanejax.report.viewer import viewer as viewer_of_result
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.ideal_scan import Scan
-from vanejax.scans.measured_scan import MeasuredScan
+from vanejax.scanner import Scan
+from vanejax.scans import MeasuredScan
 
 _HEIGHT_PX = 560
 # a reader who stands a little beside the camera sees some of its shadow

@@ -16,12 +16,12 @@ from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 from scipy.spatial import cKDTree
 
-from vanejax.cad.part import Part
-from vanejax.localization.pose_result import PoseResult
+from vanejax.cad import Part
+from vanejax.localization import PoseResult
 from vanejax.plotting.canvas import DEVIATION_COLORMAP, NO_PARTNER, SCAN
 from vanejax.plotting.deviation import color_limit_mm, overlay_rotation
 from vanejax.rigid import RigidTransform
-from vanejax.scans.measured_scan import MeasuredScan
+from vanejax.scans import MeasuredScan
 
 MAX_VERTICES = 65_535
 MAX_POINTS = 60_000

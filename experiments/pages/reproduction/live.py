@@ -18,7 +18,7 @@ from experiments.studies.position import study as position
 from experiments.studies.position.report import magnitudes, moves_of, turns_of
 from experiments.train import load_or_scan
 from vanejax.errors import InputError
-from vanejax.training.weight_file import TrainedMatcher
+from vanejax.training import TrainedMatcher
 
 FOLDER = "vane"  # as that of the study whose pictures these are
 SAME = 0.02  # relative: a live figure that differs by less is called the same

@@ -31,8 +31,8 @@ from experiments.benchmarks.vane_pairs import VanePairs
 from experiments.runner import machine
 from experiments.runner.vane_views import VaneViews
 from vanejax.errors import InputError
-from vanejax.localization.fine_registration import refine
-from vanejax.scanner.camera import Camera
+from vanejax.localization import refine
+from vanejax.scanner import Camera
 
 SMALL = VaneViews(camera=Camera().scaled(0.1))
 

@@ -16,7 +16,7 @@ from experiments.benchmarks.flops import (
     neighbor_flops,
     step_flops,
 )
-from vanejax.matching.rpmnet import RpmNet
+from vanejax.matching import RpmNet
 
 WIDTHS, ROWS = (10, 96, 96, 192), 640
 MODEL = RpmNet(num_neighbors=32)

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from experiments.benchmarks.flops import dense_flops, feature_flops, match_flops
-from vanejax.matching.rpmnet import RpmNet
+from vanejax.matching import RpmNet
 from vanejax.matching.se3 import exp_so3
 from vanejax.matching.torch_weights import load_state_dict, rpmnet_variables
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
-from vanejax.training.pairs import Pair
-from vanejax.training.rpmnet_loss import RpmNetLoss
+from vanejax.training import Pair, RpmNetLoss
 
 torch = pytest.importorskip("torch")
 

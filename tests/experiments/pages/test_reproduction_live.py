@@ -18,7 +18,7 @@ from experiments.pages.reproduction.live import (
     side_by_side,
 )
 from experiments.pages.reproduction.studies import recorded
-from vanejax.cad.parametric_vane import guide_vane
+from vanejax.cad import guide_vane
 from vanejax.errors import InputError
 
 
