@@ -53,10 +53,8 @@ def casting_map(part: Part, cast: Part) -> Figure:
         scans.append(scanner.scan(camera, view))
     offsets = [_offset_mm(scan, bare) for scan in scans]
     scale, colors = _scale(np.concatenate(offsets))
-    widths = []
-    for scan in scans:
-        rows, columns = crop(scan, camera)
-        widths.append((columns.stop - columns.start) / (rows.stop - rows.start))
+    crops = (crop(scan, camera) for scan in scans)
+    widths = [(across.stop - across.start) / (down.stop - down.start) for down, across in crops]
     figure = new_figure(WIDTH_IN, (WIDTH_IN - 0.9) / sum(widths) + 0.3)
     panels = figure.subplots(1, 2, width_ratios=widths)
     for axes, title, scan, offset in zip(panels, _SIDES_DEG, scans, offsets, strict=True):

@@ -212,9 +212,13 @@ def overlay_dots(source: np.ndarray, reference: np.ndarray, width_in: float) -> 
 
 def flattened(points: np.ndarray) -> np.ndarray:
     """Points [N, 3] as the reader sees them: x right, y up, z towards the reader."""
+    return look_at(reader_direction(), np.zeros(3)).rotate(np.asarray(points, np.float64))
+
+
+def reader_direction() -> np.ndarray:
+    """Unit vector [3], part frame, towards the reader."""
     a, b = np.radians([READER_ELEVATION_DEG, READER_AZIMUTH_DEG])
-    eye = np.array([np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)])
-    return look_at(eye, np.zeros(3)).rotate(np.asarray(points, np.float64))
+    return np.array([np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)])
 
 
 def limits(clouds: Sequence[np.ndarray]) -> np.ndarray:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.cad import Part
 from vanejax.plotting.canvas import INK, TICK_PT
-from vanejax.plotting.clouds import READER_AZIMUTH_DEG, READER_ELEVATION_DEG
+from vanejax.plotting.clouds import reader_direction
 from vanejax.plotting.shading import shade
 from vanejax.rigid import RigidTransform
 from vanejax.scanner import Camera, Scan, Scanner, look_at
@@ -201,9 +201,7 @@ def _sensor_side(
             # cameras that look along +z have y downwards
             up = np.array([0.0, -1.0 if sight[2] > 0 else 1.0, 0.0])
             return rotation @ (-sight / length), rotation @ up
-    a, b = np.radians([READER_ELEVATION_DEG, READER_AZIMUTH_DEG])
-    reader = np.array([np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)])
-    towards = reader
+    towards = reader = reader_direction()
     if len(some):
         surface, normals, _ = part.sample(4000, 0)
         nearest = cKDTree(surface).query(part_from_camera.apply(some))[1]

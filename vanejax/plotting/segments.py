@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
@@ -58,7 +57,10 @@ def segments_picture(scan: Scan, camera: Camera, scene: ClutterScene, segments: 
         (f"segmentation ({wrong:.1%} of the points wrong)", "truth"),
         strict=True,
     ):
-        _draw(axes, _colored(light, scan, camera, label), aspect, title)
+        image = _colored(light, scan, camera, label)
+        axes.imshow(image, aspect=aspect, interpolation="antialiased")
+        axes.set_axis_off()
+        axes.set_title(title, color=INK, fontsize=LABEL_PT)
     present = [s for s in Segment if np.any(truth == s) or np.any(segments.label == s)]
     name_colors(figure, {_NAMES[s]: _COLORS[s] for s in present})
     return figure
@@ -71,9 +73,3 @@ def _colored(light: np.ndarray, scan: Scan, camera: Camera, label: np.ndarray) -
     colors = np.array([to_rgb(_COLORS[s]) for s in Segment])
     image[scan.pixel] = np.clip(grey / np.percentile(grey, 80), 0.25, 1.1) * colors[label]
     return np.clip(image, 0, 1).reshape(camera.height, camera.width, 3)
-
-
-def _draw(axes: Axes, image: np.ndarray, aspect: float, title: str) -> None:
-    axes.imshow(image, aspect=aspect, interpolation="antialiased")
-    axes.set_axis_off()
-    axes.set_title(title, color=INK, fontsize=LABEL_PT)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, SymLogNorm, to_rgb
 from matplotlib.figure import Figure
@@ -58,7 +57,12 @@ def measurements_picture(
     for axes in panels.flat:
         axes.set_axis_off()
     for axes, (title, measurement) in zip(panels.flat, measurements.items(), strict=False):
-        _draw(axes, measurement, scale)
+        rows, across = crop(measurement.ideal, measurement.sensor.camera)
+        axes.imshow(
+            error_image(measurement, scale)[rows, across],
+            aspect=measurement.sensor.camera.fx / measurement.sensor.camera.fy,
+            interpolation="antialiased",
+        )
         axes.set_title(
             f"{title}\n{_figures(measurement)}", color=INK, fontsize=LABEL_PT, loc="left"
         )
@@ -105,13 +109,3 @@ def off_surface_mm(measurement: Measurement) -> np.ndarray:
     """[n] f64, how far each point stands off the face that it was measured on, outward."""
     moved = measurement.points.astype(np.float64) - measurement.ideal.points[measurement.kept]
     return np.einsum("ni,ni->n", moved, measurement.normals)
-
-
-def _draw(axes: Axes, measurement: Measurement, scale: Normalize) -> None:
-    camera = measurement.sensor.camera
-    rows, columns = crop(measurement.ideal, camera)
-    axes.imshow(
-        error_image(measurement, scale)[rows, columns],
-        aspect=camera.fx / camera.fy,
-        interpolation="antialiased",
-    )

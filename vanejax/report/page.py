@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import dataclasses
 import datetime
-import hashlib
 import importlib.metadata
 import os
 import platform
 import warnings
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,7 +17,7 @@ from scipy.special import chdtri
 from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.files import write_text
-from vanejax.localization.pose_result import Alternative, PointStatus, PoseResult, Uncertainty
+from vanejax.localization.pose_result import PointStatus, PoseResult, Uncertainty
 from vanejax.plotting.deviation import (
     STATUS_COLORS,
     color_limit_mm,
@@ -29,17 +27,10 @@ from vanejax.plotting.deviation import (
     residual_histogram,
 )
 from vanejax.plotting.scene import Scene
-from vanejax.report.pictures import Image, color_bar, figure_uris, image
-from vanejax.report.templates import source, templates
+from vanejax.report import templates
+from vanejax.report.pictures import figure_uris, image
 from vanejax.report.viewer import viewer
-from vanejax.report.wording import (
-    degrees,
-    direction,
-    fixed,
-    millimetres,
-    percent,
-    significant,
-)
+from vanejax.report.wording import fixed
 from vanejax.rigid import RigidTransform
 from vanejax.scans import MeasuredScan
 
@@ -61,8 +52,7 @@ _ADVICE = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class _Pose:
+class _Pose(NamedTuple):
     """A pose in the forms that machines ask for; all of them text."""
 
     matrix: list[list[str]]
@@ -70,38 +60,6 @@ class _Pose:
     euler: list[str]
     translation: list[str]
     locked: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class _Share:
-    """One status of the checked points."""
-
-    name: str
-    meaning: str
-    color: str
-    share: float
-    count: int
-
-
-@dataclasses.dataclass(frozen=True)
-class _AgainstTruth:
-    """How far the pose is from a known one, in the terms of `Uncertainty`."""
-
-    rotation_deg: float
-    translation_mm: float
-    axes_deg: list[str]
-    axes_mm: list[str]
-    chi_square: float
-    limit: float
-
-
-@dataclasses.dataclass(frozen=True)
-class _Other:
-    """An alternative with its picture, if it has one."""
-
-    alternative: Alternative
-    pose: _Pose
-    image: Image | None
 
 
 def write_report(
@@ -144,14 +102,11 @@ def write_report(
 
 def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransform | None) -> str:
     """The page's text."""
-    environment = templates()
-    for words in (degrees, direction, fixed, millimetres, percent, significant):
-        environment.filters[words.__name__] = words
-    style, script = source("page.css"), source("viewer.js")
     scene = Scene(part)
     before, after = overlay_pictures(result, scan, part, scene=scene)
     moved = _difference(result.before, result.part_from_camera, part.center)
-    return environment.get_template("page.html").render(
+    return templates.page(
+        "page.html",
         result=result,
         scan=scan,
         part=part,
@@ -168,7 +123,6 @@ def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransf
         if len(result.verification.deviation_mm)
         else 0.0,
         limit_mm=color_limit_mm(result.verification),
-        color_bar=color_bar(),
         histogram=figure_uris(residual_histogram(result)),
         others=_others(result, scan, part, scene),
         truth=None if truth is None else _against_truth(result, truth),
@@ -179,9 +133,6 @@ def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransf
         python=platform.python_version(),
         system=platform.platform(terse=True),
         written=datetime.datetime.now().astimezone().isoformat(sep=" ", timespec="seconds"),
-        style=style,
-        script=script,
-        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
 
 
@@ -222,7 +173,7 @@ def _difference(true: RigidTransform, found: RigidTransform, center: np.ndarray)
     return np.concatenate([turned, error.translation + rotation @ center - center])
 
 
-def _against_truth(result: PoseResult, truth: RigidTransform) -> _AgainstTruth:
+def _against_truth(result: PoseResult, truth: RigidTransform) -> dict[str, Any]:
     """The error, and its chi-square under the covariance: e^T C^-1 e, six degrees of freedom."""
     uncertainty: Uncertainty = result.uncertainty
     error = _difference(truth, result.part_from_camera, uncertainty.center)
@@ -230,20 +181,20 @@ def _against_truth(result: PoseResult, truth: RigidTransform) -> _AgainstTruth:
         chi_square = float(error @ np.linalg.solve(uncertainty.covariance, error))
     except np.linalg.LinAlgError:
         chi_square = float("nan")
-    return _AgainstTruth(
-        rotation_deg=float(np.degrees(np.linalg.norm(error[:3]))),
-        translation_mm=float(np.linalg.norm(error[3:])),
-        axes_deg=[fixed(v, 5) for v in np.degrees(error[:3])],
-        axes_mm=[fixed(v, 5) for v in error[3:]],
-        chi_square=chi_square,
-        limit=float(chdtri(6, 0.05)),
-    )
+    return {
+        "rotation_deg": float(np.degrees(np.linalg.norm(error[:3]))),
+        "translation_mm": float(np.linalg.norm(error[3:])),
+        "axes_deg": [fixed(v, 5) for v in np.degrees(error[:3])],
+        "axes_mm": [fixed(v, 5) for v in error[3:]],
+        "chi_square": chi_square,
+        "limit": float(chdtri(6, 0.05)),
+    }
 
 
-def _shares(result: PoseResult) -> list[_Share]:
+def _shares(result: PoseResult) -> list[dict[str, Any]]:
     """How many of the checked points have each status."""
     status = result.verification.status
-    found = []
+    rows = []
     for value in PointStatus:
         name, meaning = _MEANING[value]
         count = int(np.count_nonzero(status == value))
@@ -251,19 +202,20 @@ def _shares(result: PoseResult) -> list[_Share]:
         # the ray's side of a surface has a meaning only if there is a ray
         if value is PointStatus.BEHIND and np.isnan(result.verification.violation_share):
             share = float("nan")
-        found.append(_Share(name, meaning, STATUS_COLORS[value], share, count))
-    return found
+        row = {"name": name, "meaning": meaning, "share": share, "count": count}
+        rows.append(row | {"color": STATUS_COLORS[value]})
+    return rows
 
 
-def _others(result: PoseResult, scan: MeasuredScan, part: Part, scene: Scene) -> list[_Other]:
+def _others(
+    result: PoseResult, scan: MeasuredScan, part: Part, scene: Scene
+) -> list[dict[str, Any]]:
     """The alternatives; the first few with a picture, each from beside its own sensor."""
-    return [
-        _Other(
-            alternative,
-            _pose(alternative.part_from_camera),
-            image(pose_picture(scan, part, alternative.part_from_camera, scene=scene))
-            if index < _MOST_PICTURES
-            else None,
-        )
-        for index, alternative in enumerate(result.alternatives)
-    ]
+    rows = []
+    for alternative in result.alternatives:
+        found = alternative.part_from_camera
+        picture = None
+        if len(rows) < _MOST_PICTURES:
+            picture = image(pose_picture(scan, part, found, scene=scene))
+        rows.append({"alternative": alternative, "pose": _pose(found), "image": picture})
+    return rows

@@ -6,9 +6,7 @@ A `View3d` at the end of a cell shows itself in Jupyter, VS Code and exported HT
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import hashlib
 import html
 import os
 from collections.abc import Sequence
@@ -25,8 +23,7 @@ from vanejax.localization import PoseResult
 from vanejax.plotting.canvas import HIDDEN, SCAN
 from vanejax.plotting.clouds import seen_and_hidden
 from vanejax.plotting.deviation import color_limit_mm
-from vanejax.report.pictures import color_bar
-from vanejax.report.templates import source, templates
+from vanejax.report import templates
 from vanejax.report.viewer import MAX_POINTS, scene_json, simplified, spacing_mm
 from vanejax.report.viewer import viewer as viewer_of_result
 from vanejax.rigid import RigidTransform
@@ -75,26 +72,18 @@ class View3d:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Legend:
-    """One colour of the dots: what `page.css` calls it, and what it means."""
-
-    dot: str
-    meaning: str
-
-
-@dataclasses.dataclass(frozen=True)
 class _Controls:
     """How the poses are chosen and the dots explained.
 
     Attributes:
       poses: names of the poses; a single one is no choice.
-      legend: of the dots.
+      legend: colours of the dots: what `page.css` calls each, and what it means.
       limit_mm: end of the colour bar; 0 where dots are not coloured by deviation.
       first: the pose shown at the start.
     """
 
     poses: Sequence[str]
-    legend: Sequence[_Legend]
+    legend: Sequence[tuple[str, str]]
     limit_mm: float = 0.0
     first: int = 0
 
@@ -114,90 +103,41 @@ def scan_view(scan: Scan, part: Part, *, voxel_mm: float = 1.5) -> View3d:
         raise InputError(f"voxel_mm={voxel_mm!r} should be positive, in mm")
     seen, hidden = seen_and_hidden(scan, voxel_mm=voxel_mm)
     codes = np.concatenate([np.full(len(seen), -_CODE_UM), np.full(len(hidden), _CODE_UM)])
+    points = np.concatenate([seen, hidden])
+    if len(points) > MAX_POINTS:
+        some = np.random.default_rng(0).choice(len(points), MAX_POINTS, replace=False)
+        points, codes = points[some], codes[some]
+    vertices, faces, _ = simplified(
+        np.asarray(part.mesh.vertices, np.float64), np.asarray(part.mesh.faces)
+    )
+    turn = Rotation.from_euler("yx", [_YAW_DEG, _PITCH_DEG], degrees=True).as_matrix()
+    reader_from_part = turn @ np.asarray(scan.camera_from_part.rotation, np.float64)
+    shown = np.concatenate([vertices, points[:: max(1, len(points) // 500)]])
     here = RigidTransform.identity(dtype=np.float64)
-    scene = _scene(
-        part, np.concatenate([seen, hidden]), [here, here], codes_um=codes,
+    scene = scene_json(
+        part,
+        vertices,
+        faces,
+        points,
+        {"0": here, "1": here},
+        measured=("0", "1"),
+        half_mm=np.abs((shown - part.center) @ reader_from_part.T).max(axis=0),
+        codes_um=codes,
         colors=_SCAN_AND_HIDDEN,
-        reader_from_part=_beside(scan.camera_from_part.rotation), lift_mm=0.002 * part.radius,
-    )  # fmt: skip
-    legend = [_Legend("scan", "seen"), _Legend("hidden", "hidden by self-occlusion")]
-    return _view(scene, _Controls(["scan"], [*legend, _Legend("metal", "CAD")]))
+        limit_mm=_CODE_UM / 1000,
+        reader_from_part=reader_from_part,
+        spacing_mm=min(_DOT * spacing_mm(points), _LARGEST_DOT * part.radius),
+        lift_mm=0.002 * part.radius,
+    )
+    legend = [("scan", "seen"), ("hidden", "hidden by self-occlusion"), ("metal", "CAD")]
+    return View3d(templates.page("view3d.html", scene=scene, controls=_Controls(["scan"], legend)))
 
 
 def pose_view(result: PoseResult, scan: MeasuredScan, part: Part) -> View3d:
     """The scan on the part at every pose of a result, and where it deviates: as in the report."""
     shown = viewer_of_result(result, scan, part)
     lost = np.isnan(result.verification.deviation_mm).any()
-    legend = [_Legend("lost", "no partner on the part")] if lost else []
+    legend = [("lost", "no partner on the part")] if lost else []
     limit_mm = color_limit_mm(result.verification)
     controls = _Controls(shown.poses, legend, limit_mm=limit_mm, first=1)
-    return _view(shown.json, controls)
-
-
-def _beside(camera_from_part: np.ndarray) -> np.ndarray:
-    """reader_from_part [3, 3] of a reader who stands to the left of a camera, and above it."""
-    turn = Rotation.from_euler("yx", [_YAW_DEG, _PITCH_DEG], degrees=True).as_matrix()
-    return turn @ np.asarray(camera_from_part, np.float64)
-
-
-def _scene(
-    part: Part,
-    points: np.ndarray,
-    poses: Sequence[RigidTransform],
-    *,
-    codes_um: np.ndarray,
-    colors: np.ndarray,
-    reader_from_part: np.ndarray,
-    lift_mm: float,
-) -> str:
-    """What `viewer.js` reads, as `viewer.viewer` writes it, for a cloud that has no result.
-
-    Args:
-      part: shown as a surface.
-      points: [N, 3] mm.
-      poses: part_from_points, at least two.
-      codes_um: [N], from -32,000 to 32,000: where in ``colors`` a dot finds its own.
-      colors: [256, 4], 0 to 1.
-      reader_from_part: [3, 3], rows right, up, towards the reader.
-      lift_mm: how far in front of the surface dots are drawn, at least.
-    """
-    if len(points) > MAX_POINTS:
-        some = np.random.default_rng(0).choice(len(points), MAX_POINTS, replace=False)
-        points, codes_um = points[some], codes_um[some]
-    vertices, faces, _ = simplified(
-        np.asarray(part.mesh.vertices, np.float64), np.asarray(part.mesh.faces)
-    )
-    # as far as any pose takes the cloud, and the part itself
-    corners = [vertices, *(pose.apply(points[:: max(1, len(points) // 500)]) for pose in poses)]
-    half = [np.abs((c - part.center) @ reader_from_part.T).max(axis=0) for c in corners]
-    names = [str(number) for number in range(len(poses))]
-    return scene_json(
-        part,
-        vertices,
-        faces,
-        points,
-        dict(zip(names, poses, strict=True)),
-        measured=names,
-        half_mm=np.max(half, axis=0),
-        codes_um=codes_um,
-        colors=colors,
-        limit_mm=_CODE_UM / 1000,
-        reader_from_part=reader_from_part,
-        spacing_mm=min(_DOT * spacing_mm(points), _LARGEST_DOT * part.radius),
-        lift_mm=lift_mm,
-    )
-
-
-def _view(scene: str, controls: _Controls) -> View3d:
-    """The page around a scene."""
-    environment = templates()
-    script = source("viewer.js")
-    page = environment.get_template("view3d.html").render(
-        scene=scene,
-        controls=controls,
-        color_bar=color_bar(),
-        style=source("page.css"),
-        script=script,
-        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-    )
-    return View3d(page)
+    return View3d(templates.page("view3d.html", scene=shown.json, controls=controls))
