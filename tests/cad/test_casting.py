@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from vanejax.cad import Part, guide_vane, part_from_mesh
 from vanejax.cad.investment_casting import CUT, InvestmentCasting, as_cast, waviness
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.plotting.casting import casting_map
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Camera, Scanner, hemisphere_viewpoints
 
 NOTHING = InvestmentCasting(allowance_mm=0, waviness_mm=0)
 STOCK = dataclasses.replace(NOTHING, allowance_mm=0.5)

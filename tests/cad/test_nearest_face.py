@@ -7,9 +7,7 @@ import pytest
 import trimesh
 from trimesh.triangles import closest_point
 
-from vanejax.cad.nearest_face import NearestFace
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cad import NearestFace, Part, guide_vane, part_from_mesh
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import trimesh
 
 from vanejax.cad.part import SIZES_MM, Part, load_part, part_from_mesh
 from vanejax.errors import InputError
-from vanejax.scanner.camera import Camera
+from vanejax.scanner import Camera
 
 
 def box(extents=(100.0, 50.0, 20.0), at=(0.0, 0.0, 0.0)) -> trimesh.Trimesh:

@@ -7,7 +7,7 @@ import pytest
 from example_scans import box, model, vane
 from trimesh.triangles import closest_point
 
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.cad.surface import CELLS, Surface
 
 

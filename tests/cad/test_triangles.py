@@ -15,9 +15,7 @@ from example_scans import vane
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from vanejax.cad import triangles
-from vanejax.cad.part import Part, load_part
-from vanejax.cad.surface import Surface
+from vanejax.cad import Part, Surface, load_part, triangles
 from vanejax.cad.triangles import Edges, Triangles, canonical, drop_doubled, weld
 
 COORDINATES = [-2.5, -1.0, -0.0, 0.0, 1e-30, 1.0, 3.0]

@@ -16,8 +16,8 @@ import pytest
 import scipy.optimize
 import scipy.spatial
 
+from vanejax.cad import Part
 from vanejax.cad.parametric_vane import DOUBLET, GuideVaneSegment, guide_vane
-from vanejax.cad.part import Part
 from vanejax.errors import InputError
 
 

@@ -8,7 +8,7 @@ import scipy.spatial
 import trimesh
 
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera, look_at
+from vanejax.scanner import Camera, look_at
 from vanejax.scanner.image_window import SIDES, PartEnvelope, Window
 
 POSE = look_at(400 * np.array([0.43301, 0.25, 0.86603]), np.zeros(3))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vanejax.scanner.camera import Camera, look_at
+from vanejax.scanner import Camera, look_at
 from vanejax.scanner.image_window import Window
 from vanejax.scanner.pixel_rays import MeasuredPixels, PixelRays
 

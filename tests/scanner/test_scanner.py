@@ -7,14 +7,11 @@ import pytest
 import scipy.spatial
 import trimesh
 
-from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cad import Part, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints, look_at
-from vanejax.scanner.ideal_scan import Scan
+from vanejax.scanner import Camera, Scan, Scanner, hemisphere_viewpoints, look_at, scan_views
 from vanejax.scanner.image_window import PartEnvelope, Window
-from vanejax.scanner.viewpoint_scans import scan_views
-from vanejax.scanner.virtual_scanner import Scanner
 
 ORIGIN = np.zeros(3)
 ABOVE = look_at(np.array([0.0, 0.0, 400.0]), ORIGIN)

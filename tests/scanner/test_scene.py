@@ -8,10 +8,10 @@ import scipy.spatial
 import trimesh
 from example_scans import SMALL, VIEW, bracket, vane
 
-from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cad import Part, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import hemisphere_viewpoints
+from vanejax.scanner import Scanner, hemisphere_viewpoints
 from vanejax.scanner.clutter import (
     Clutter,
     ClutterScene,
@@ -21,7 +21,6 @@ from vanejax.scanner.clutter import (
     coolant_drops,
     table,
 )
-from vanejax.scanner.virtual_scanner import Scanner
 
 FULL = Clutter(table=True, tilt_deg=3.0, clamps=2, chips=25, drops=20)
 ROUNDING_MM = 1e-4  # float32 at 600 mm is good to 3e-5 mm

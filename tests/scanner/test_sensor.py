@@ -9,15 +9,20 @@ import pytest
 import trimesh
 from scipy.special import erf
 
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cad import Part, guide_vane, part_from_mesh
 from vanejax.errors import InputError
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints, look_at
+from vanejax.scanner import (
+    Camera,
+    Measurement,
+    Reason,
+    Scanner,
+    hemisphere_viewpoints,
+    look_at,
+    measure,
+)
 from vanejax.scanner.exposure import Exposure
-from vanejax.scanner.measurement import Measurement, Reason, measure
 from vanejax.scanner.range_errors import Trueness, near_outline, window_mean
 from vanejax.scanner.sensor import PRESETS, Sensor, preset
-from vanejax.scanner.virtual_scanner import Scanner
 
 CAMERA = Camera(width=320, height=256, near_mm=100.0)
 ABOVE = look_at(np.array([0.0, 0.0, 400.0]), np.zeros(3))

@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vanejax.cad.parametric_vane import guide_vane
+from vanejax.cad import guide_vane
 from vanejax.errors import InputError
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Camera, Scanner, hemisphere_viewpoints
 from vanejax.scans.measured_scan import clean_scan, repeats
 from vanejax.scans.viewpoint import why_not_from
 

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vanejax.cad.parametric_vane import guide_vane
+from vanejax.cad import guide_vane
 from vanejax.errors import InputError
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Camera, Scanner, hemisphere_viewpoints
 from vanejax.scans.normals import _enough_neighbors, _planes_at, estimate_normals
 
 

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from example_scans import bracket, measured_points, random_view, vane, with_noise
 
-from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cad import Part, part_from_mesh
 from vanejax.errors import InputError
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
+from vanejax.scanner import Camera, hemisphere_viewpoints
 from vanejax.scanner.clutter import Clutter, ClutterObject, ClutterScene, clutter_scene, table
 from vanejax.scans.segmentation import Segment, is_larger, segment
 from vanejax.scans.table_planes import largest_slab_mm2

@@ -1,8 +1,9 @@
 """A guide-vane segment: the turbine nozzle part that stands in for the paper's unpublished CAD.
 
 Several vanes stand between an inner and an outer platform, which carry the rails that hang the
-segment in its casing. The shape is built in ring coordinates (axial downstream from the trailing
-edges, angle about the engine's axis, radius) and delivered in the part's frame: x along the
+segment in its casing. The shape is built in ring coordinates (axial mm, downstream from the
+trailing edges; angle about the engine's axis, radians; radius mm; x = radius sin(angle),
+y = radius cos(angle), z = -axial) and delivered in the part's frame: x along the
 circumference, y radially outward, z upstream, so that the leading edges look toward +z; the
 origin is the middle of the axis-aligned bounding box.
 """
@@ -17,7 +18,6 @@ import manifold3d
 import numpy as np
 
 from vanejax.cad.airfoil import Airfoil, require_number, require_simple
-from vanejax.cad.lofted_solid import PROFILE, SECTION, loft_sections
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
 
@@ -30,6 +30,8 @@ _SPAN_ROWS = 14
 _FILLET_SUNK_MM = 0.1
 # The cuts leave slivers; edges and bumps below this size are merged away.
 _SLIVER_MM = 1e-3
+# The two ring coordinates in which an airfoil's section and a platform's profile are drawn.
+_SECTION, _PROFILE = (0, 1), (0, 2)
 _INNER_AIRFOIL = Airfoil(
     axial_chord_mm=33.0,
     tangential_chord_mm=34.5,
@@ -201,20 +203,18 @@ def guide_vane(segment: GuideVaneSegment = DOUBLET) -> Part:
     vane = _vane_rings(segment)
     middle = _platform_middle(segment, vane)
     pitches = (np.arange(segment.vanes) - (segment.vanes - 1) / 2) * segment.pitch_rad
-    solids = [loft_sections(vane + np.array([0, pitch, 0]), SECTION) for pitch in pitches]
+    solids = [_loft(vane + np.array([0, pitch, 0]), _SECTION) for pitch in pitches]
     half_width = 0.5 * (segment.vanes * segment.pitch_rad - _gap_angle(segment))
     inner, outer, rail_slot = _platform_profiles(segment)
     solids += [
-        loft_sections(_sweep(segment, profile, middle - half_width, middle + half_width), PROFILE)
+        _loft(_sweep(segment, profile, middle - half_width, middle + half_width), _PROFILE)
         for profile in (inner, outer)
     ]
     solid = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
     if segment.slot_width_mm > 0:
         left = middle - 0.25 * segment.vanes * segment.pitch_rad
         width = segment.slot_width_mm / segment.outer_radius_mm
-        solid -= loft_sections(
-            _sweep(segment, rail_slot, left - width / 2, left + width / 2), PROFILE
-        )
+        solid -= _loft(_sweep(segment, rail_slot, left - width / 2, left + width / 2), _PROFILE)
     mesh = solid.simplify(_SLIVER_MM).to_mesh64()
     vertices = np.asarray(mesh.vert_properties)[:, :3]
     vertices = vertices - 0.5 * (vertices.min(0) + vertices.max(0))
@@ -343,3 +343,36 @@ def _sweep(
     axial, radius = profile.T
     turned = angles[:, None] + _slash(segment, axial)
     return np.stack(np.broadcast_arrays(axial, turned, radius), -1)
+
+
+def _loft(rings: np.ndarray, flat: tuple[int, int]) -> manifold3d.Manifold:
+    """The solid whose skin joins rings of ring coordinates, in x, y, z about the engine's axis.
+
+    Args:
+      rings: [S, P, 3]; ring i and i + 1 are joined point by point.
+      flat: the two ring coordinates in which the first and the last ring are simple polygons,
+        counter-clockwise; their triangles close the ends.
+    """
+    stations, count, _ = rings.shape
+    axial, angle, radius = np.moveaxis(rings, -1, 0)
+    vertices = np.stack([radius * np.sin(angle), radius * np.cos(angle), -axial], -1)
+    corner = np.arange(count)
+    after = np.roll(corner, -1)
+    rows = count * np.arange(stations - 1)[:, None]
+    quads = np.stack([rows + corner, rows + after, rows + count + after, rows + count + corner], -1)
+    # angles are in radians: at the size of the ring they are as long as the axial coordinates
+    scaled = rings * [1.0, radius.mean(), 1.0]
+    ends = [manifold3d.triangulate([scaled[i][:, flat]]) for i in (0, -1)]
+    faces = np.concatenate(
+        [
+            quads[..., [0, 1, 2]].reshape(-1, 3),
+            quads[..., [0, 2, 3]].reshape(-1, 3),
+            ends[0][:, ::-1],
+            ends[1] + count * (stations - 1),
+        ]
+    )
+    # (axial, angle, radius) -> (x, y, z) mirrors; so does reading a profile as (axial, radius)
+    if flat == _SECTION:
+        faces = faces[:, ::-1]
+    mesh = manifold3d.Mesh64(vertices.reshape(-1, 3), faces.astype(np.uint64))
+    return manifold3d.Manifold(mesh)

@@ -50,7 +50,11 @@ class Triangles:
     def volume(self) -> float:
         """What the faces enclose, negative where they face inward."""
         about = self.bounds().mean(axis=0)
-        return sum(signed_volume(corners, about=about) for corners in self.blocks())
+        volume = 0.0
+        for corners in self.blocks():
+            a, b, c = np.moveaxis(corners - about, 1, 0)
+            volume += float(np.sum(a * np.cross(b, c))) / 6
+        return volume
 
     def diagonal(self) -> float:
         """Length of the bounding box's diagonal."""
@@ -221,16 +225,6 @@ def areas(corners: np.ndarray) -> np.ndarray:
     """Areas [F] of triangles [F, 3, 3]."""
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return 0.5 * np.linalg.norm(cross, axis=1)
-
-
-def signed_volume(corners: np.ndarray, *, about: np.ndarray | None = None) -> float:
-    """Signed volume between triangles [F, 3, 3] and a point near them, for accuracy.
-
-    Where the triangles are closed, any point will do: their own middle if none is given.
-    """
-    middle = corners.mean(axis=(0, 1)) if about is None else about
-    a, b, c = np.moveaxis(corners - middle, 1, 0)
-    return float(np.sum(a * np.cross(b, c))) / 6
 
 
 def counted(number: int, noun: str) -> str:

@@ -8,8 +8,9 @@ import itertools
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
+
+from vanejax.cad.solid_bodies import connected
 
 CREASE = 0.15  # rad by which the normals of neighbouring voxels turn towards each other
 
@@ -69,7 +70,7 @@ class Voxels:
 
     def clusters(self) -> np.ndarray:
         """[V] i32: voxels that hang together have the same number, from 0."""
-        return _components(self.neighbors, len(self))
+        return connected(self.neighbors.T, len(self))[1]
 
     def pieces(self, sensor_origin: np.ndarray, *, least: int) -> np.ndarray:
         """[V] i32: clusters parted where the surface folds inwards, as between part and clamp.
@@ -90,7 +91,7 @@ class Voxels:
         folded = fold < -CREASE
         smooth[first[folded]] = smooth[second[folded]] = False
         inside = smooth[first] & smooth[second]
-        piece = _components(self.neighbors[:, inside], len(self))
+        piece = connected(self.neighbors[:, inside].T, len(self))[1]
         count = np.bincount(piece)
         core = smooth & (count[piece] >= least)
         if not core.any():
@@ -114,9 +115,3 @@ class Voxels:
         normals = np.linalg.eigh(spread)[1][:, :, 0]
         side = np.einsum("vi,vi->v", normals, sensor_origin - self.middle)
         return np.where(side[:, None] < 0, -normals, normals)
-
-
-def _components(pairs: np.ndarray, count: int) -> np.ndarray:
-    """[count] i32: what pairs [2, E] connect has the same number, from 0."""
-    graph = sparse.coo_matrix((np.ones(pairs.shape[1], bool), tuple(pairs)), shape=(count, count))
-    return csgraph.connected_components(graph, directed=False)[1]
