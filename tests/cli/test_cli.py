@@ -19,15 +19,13 @@ from example_result import example_result, pose
 import vanejax.localization.registration
 import vanejax.report
 import vanejax.training.export
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cad import Part, guide_vane, part_from_mesh
 from vanejax.cli.pose_summary import verdict_line
 from vanejax.cli.program import main
 from vanejax.cli.register import wants_color
 from vanejax.cli.scan import parse_views
 from vanejax.machine.pose_file import pose_to_dict, read_pose
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Camera, Scanner, hemisphere_viewpoints
 from vanejax.scans.scan_file import load_scan
 
 ROOT = Path(__file__).parents[2]

@@ -15,8 +15,7 @@ from vanejax.cad.cad_file import MM_PER_UNIT, read_triangles
 from vanejax.cad.parametric_vane import guide_vane
 from vanejax.cli.inspection import inspect
 from vanejax.errors import InputError
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Camera, Scanner, hemisphere_viewpoints
 from vanejax.scans.scan_file import save_points
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"

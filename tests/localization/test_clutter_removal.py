@@ -22,17 +22,12 @@ from example_scans import (
 
 from vanejax.cli.program import main
 from vanejax.errors import InputError
-from vanejax.localization import clutter_removal
+from vanejax.localization import PoseResult, clutter_removal, register
 from vanejax.localization.clutter_removal import segmentations, with_clutter, without_clutter
-from vanejax.localization.pose_result import PoseResult
-from vanejax.localization.registration import register
 from vanejax.machine.pose_file import read_pose
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.clutter import Clutter, clutter_scene
-from vanejax.scans.measured_scan import MeasuredScan, clean_scan
-from vanejax.scans.scan_file import save_points
-from vanejax.scans.segmentation import Segment, Segments
+from vanejax.scanner import Camera, Clutter, clutter_scene, hemisphere_viewpoints
+from vanejax.scans import MeasuredScan, Segment, Segments, clean_scan, save_points
 
 CAMERA = Camera(width=320, height=256, near_mm=200.0)
 EVERYTHING = Clutter(table=True, tilt_deg=2.0, clamps=2, chips=15, drops=10)

@@ -13,16 +13,12 @@ from experiments.studies.verdicts.depth_camera import random_pose
 from vanejax.cad.part import Part
 from vanejax.cli.program import main
 from vanejax.errors import InputError
+from vanejax.localization import RayCasting, measurement_model, refine, register
 from vanejax.localization.edge_rounding import ROUNDS, refine_sharpened, without_rounding
-from vanejax.localization.fine_registration import refine
 from vanejax.localization.pose_result import Refinement
-from vanejax.localization.registration import register
-from vanejax.localization.residuals import RayCasting, measurement_model
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.measurement import Measurement, measure
-from vanejax.scanner.sensor import Sensor, preset
-from vanejax.scans.measured_scan import MeasuredScan
-from vanejax.scans.scan_file import save_points
+from vanejax.scanner import Measurement, Sensor, measure, preset
+from vanejax.scans import MeasuredScan, save_points
 
 FULL = preset("consumer_depth")
 WINDOW = Sensor(

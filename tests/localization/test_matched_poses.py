@@ -24,8 +24,7 @@ from vanejax.pointcloud import PointCloud, voxel_thin
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera
 from vanejax.scans.measured_scan import clean_scan
-from vanejax.training.pairs import PairSampling
-from vanejax.training.weight_file import TrainedMatcher
+from vanejax.training import PairSampling, TrainedMatcher
 
 MODEL = RpmNet(num_neighbors=8, radius=0.5, sinkhorn_iterations=2, feature_width=8)
 

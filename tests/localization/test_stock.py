@@ -13,11 +13,9 @@ from example_scans import pose_error, vane, with_noise
 from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cli.program import main
 from vanejax.errors import InputError
-from vanejax.localization.pose_result import PoseResult
-from vanejax.localization.registration import register
+from vanejax.localization import PoseResult, register
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Camera, Scanner, hemisphere_viewpoints
 from vanejax.scans.scan_file import save_points
 
 STOCK_MM = 0.5

@@ -20,8 +20,7 @@ from example_scans import (
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vanejax.cad.parametric_vane import GuideVaneSegment
-from vanejax.cad.part import part_from_mesh
+from vanejax.cad import GuideVaneSegment, part_from_mesh
 from vanejax.localization.pose_result import PointStatus, Verification
 from vanejax.localization.residuals import SurfaceMatching
 from vanejax.localization.scan_patches import View

@@ -11,8 +11,7 @@ from example_result import pose
 from scipy.spatial.transform import Rotation
 
 import vanejax
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cad import Part, guide_vane, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.machine.controllers import Compensation
 from vanejax.machine.frame_notation import read_kuka, write_kuka
@@ -25,8 +24,7 @@ from vanejax.machine.tool_path import (
     write_tool_path,
 )
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Camera, Scanner, hemisphere_viewpoints
 from vanejax.scans.measured_scan import clean_scan
 
 DOWN = np.array([0.0, 0.0, -1.0])

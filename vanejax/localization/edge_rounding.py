@@ -18,9 +18,7 @@ from vanejax.localization.fine_registration import refine
 from vanejax.localization.pose_result import Refinement
 from vanejax.localization.residuals import RayCasting
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.measurement import measure
-from vanejax.scanner.sensor import Sensor
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Scanner, Sensor, measure
 from vanejax.scans.measured_scan import MeasuredScan
 
 ROUNDS = 2  # the first does nearly all of it: of 1.07 deg it leaves 0.13, the second 0.10

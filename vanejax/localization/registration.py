@@ -30,9 +30,7 @@ from vanejax.localization.residuals import MeasurementModel, RayCasting, measure
 from vanejax.localization.verdict import Limits
 from vanejax.rigid import RigidTransform, rigid_from_matrix
 from vanejax.scanner.sensor import Sensor, preset
-from vanejax.scans.measured_scan import MeasuredScan, clean_scan
-from vanejax.scans.scan_file import load_scan
-from vanejax.scans.segmentation import Segments
+from vanejax.scans import MeasuredScan, Segments, clean_scan, load_scan
 
 if TYPE_CHECKING:
     from vanejax.training.weight_file import TrainedMatcher

@@ -14,8 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from vanejax.cad.nearest_face import NearestFace
-from vanejax.cad.part import Part
+from vanejax.cad import NearestFace, Part
 from vanejax.errors import InputError
 from vanejax.files import write_text
 from vanejax.machine.controllers import Compensation
