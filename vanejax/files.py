@@ -159,9 +159,7 @@ def write_arrays(
             file.write(safetensors.numpy.save(arrays, metadata))
 
 
-def read_arrays(
-    path: str | os.PathLike[str],
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays by name, and the header, of an .npz or safetensors file; its contents say which.
 
     Nothing is unpickled, and no size in the file is trusted. A header that is not there, or that

@@ -22,10 +22,7 @@ from vanejax.scans import MeasuredScan, save_points
 
 FULL = preset("consumer_depth")
 WINDOW = Sensor(
-    camera=FULL.camera,
-    baseline_mm=FULL.baseline_mm,
-    window_px=FULL.window_px,
-    jump_mm=FULL.jump_mm,
+    camera=FULL.camera, baseline_mm=FULL.baseline_mm, window_px=FULL.window_px, jump_mm=FULL.jump_mm
 )
 
 

@@ -7,14 +7,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from example_scans import (
-    batch,
-    disturbed,
-    exact_points,
-    ideal_scan,
-    random_view,
-    vane,
-)
+from example_scans import batch, disturbed, exact_points, ideal_scan, random_view, vane
 from scipy.spatial.transform import Rotation
 
 from vanejax.localization import matched_poses

@@ -36,12 +36,7 @@ def placement(rng: np.random.Generator) -> RigidTransform:
 
 
 def placements(
-    seed: int,
-    count: int = 8,
-    *,
-    camera_mm: float = 0.0,
-    probe_mm: float = 0.0,
-    touched: int = 9,
+    seed: int, count: int = 8, *, camera_mm: float = 0.0, probe_mm: float = 0.0, touched: int = 9
 ) -> tuple[list[Cube], list[Cube]]:
     """Cubes of camera and machine, the camera's faces named as it happens."""
     rng = np.random.default_rng(seed)

@@ -16,12 +16,7 @@ from vanejax.cli.compensate import FORMATS
 from vanejax.errors import InputError
 from vanejax.machine import frame_notation
 from vanejax.machine.controllers import Compensation, axis_angle_deg, read_frame, rounding_error_mm
-from vanejax.machine.frame_notation import (
-    NOTATIONS,
-    notation_of,
-    read_iso,
-    write_iso,
-)
+from vanejax.machine.frame_notation import NOTATIONS, notation_of, read_iso, write_iso
 from vanejax.rigid import RigidTransform
 
 RADIUS = 120.0

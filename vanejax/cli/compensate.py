@@ -41,10 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"machine_from_part as the program presumes it: {_FRAME_HELP}",
     )
     parser.add_argument(
-        "--format",
-        choices=(*FORMATS, "all"),
-        default="all",
-        help="for which controller (all)",
+        "--format", choices=(*FORMATS, "all"), default="all", help="for which controller (all)"
     )
     parser.add_argument(
         "--accept-verdict",
@@ -172,6 +169,9 @@ def _refusal(record: PoseRecord, arguments: argparse.Namespace) -> int:
 
 
 def _work_frame(machine_from_part: RigidTransform, chosen: str, part: Part | None) -> list[str]:
+    import numpy as np
+
+    from vanejax.machine.controllers import rounding_error_mm
     from vanejax.machine.frame_notation import NOTATIONS
 
     lines = ["work frame: machine_from_part, where the part sits in the machine"]
@@ -181,21 +181,10 @@ def _work_frame(machine_from_part: RigidTransform, chosen: str, part: Part | Non
         text = notation.write(machine_from_part)
         lines += [f"  {line}" for line in text.splitlines()]
         if part is not None:
-            lines.append(f"  rounding: at most {_rounding(name, machine_from_part, part):.1e} mm")
+            farthest = float(np.linalg.norm(part.mesh.vertices, axis=1).max())
+            off = rounding_error_mm(notation.read(text), machine_from_part, farthest)
+            lines.append(f"  rounding: at most {off:.1e} mm")
     return lines
-
-
-def _rounding(name: str, machine_from_part: RigidTransform, part: Part) -> float:
-    """What reading the text again is off by on the part, mm."""
-    import numpy as np
-
-    from vanejax.machine.controllers import rounding_error_mm
-    from vanejax.machine.frame_notation import NOTATIONS
-
-    notation = NOTATIONS[name]
-    farthest = float(np.linalg.norm(part.mesh.vertices, axis=1).max())
-    written = notation.read(notation.write(machine_from_part))
-    return rounding_error_mm(written, machine_from_part, farthest)
 
 
 def _compensation(compensation: Compensation, chosen: str, part: Part | None) -> list[str]:
@@ -211,10 +200,7 @@ def _compensation(compensation: Compensation, chosen: str, part: Part | None) ->
     lines.append(
         f"  the part's {place} is moved by {_vector(actual - nominal)} mm (machine x, y, z)"
     )
-    for frame, motion in (
-        ("machine", compensation.in_machine),
-        ("part", compensation.in_part),
-    ):
+    for frame, motion in (("machine", compensation.in_machine), ("part", compensation.in_part)):
         lines.append(f"  {_turn(motion)} (in the {frame}'s frame)")
     names = [n for n in COMPENSATION_FORMATS if chosen in (n, "all")] or ["matrix"]
     for frame, motion, formula in (

@@ -2,8 +2,7 @@
 
 Stereo finds the mean depth of a window, so that outer edges are measured too far and inner ones too
 near (`vanejax.scanner.range_errors.windowed`), over a millimetre deep with a coarse camera. That is
-no
-noise: it pulls the pose. At a pose that is about right, the virtual sensor says by how much each
+no noise: it pulls the pose. At a pose that is about right, the virtual sensor says by how much each
 pixel is off, and the fine registration goes on from the points without it.
 """
 

@@ -62,27 +62,21 @@ def match_poses(
     inits = RigidTransform(
         jnp.asarray(guesses.rotation, jnp.float32), jnp.asarray(shift / radius, jnp.float32)
     )
+    at_once = None if jax.default_backend() == "cpu" else AT_ONCE_ON_ACCELERATOR  # None: one by one
     matched = jax.device_get(
-        _match(matcher.model, iterations, _at_once(), matcher.variables, source, target, inits)
+        _match(matcher.model, iterations, at_once, matcher.variables, source, target, inits)
     )
     # float32 rotations are orthonormal to 1e-7 only
     u, _, vt = np.linalg.svd(np.nan_to_num(np.asarray(matched.rotation, np.float64)))
     rotation = u @ vt
     translation = radius * np.asarray(matched.translation, np.float64)
     translation = translation + matcher.center - rotation @ middle
-    finite = np.isfinite(matched.rotation).all(axis=(1, 2)) & np.isfinite(matched.translation).all(
-        1
-    )
-    finite &= np.linalg.det(rotation) > 0
+    finite = np.isfinite(matched.rotation).all(axis=(1, 2)) & (np.linalg.det(rotation) > 0)
+    finite &= np.isfinite(matched.translation).all(axis=1)
     return RigidTransform(
         np.where(finite[:, None, None], rotation, guesses.rotation),
         np.where(finite[:, None], translation, guesses.translation),
     )
-
-
-def _at_once() -> int | None:
-    """How many hypotheses to vmap together on the device at hand; None is one by one."""
-    return None if jax.default_backend() == "cpu" else AT_ONCE_ON_ACCELERATOR
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))

@@ -161,9 +161,8 @@ class SurfaceMatching:
         precision: Precision = "faces",
     ) -> Residuals:
         """See `MeasurementModel`: point to plane, with the plane of the nearest face."""
-        moved = part_from_camera.apply(
-            np.broadcast_to(points, (*_batch(part_from_camera), *points.shape))
-        )
+        batch = part_from_camera.rotation.shape[:-2]
+        moved = part_from_camera.apply(np.broadcast_to(points, (*batch, *points.shape)))
         flat = moved.reshape(-1, 3)
         closest = _closest_points(self.surface, flat, "grid" if precision == "grid" else "samples")
         offset = flat - closest.points
@@ -196,10 +195,6 @@ def moved(part: Part, part_from_camera: RigidTransform, delta: np.ndarray) -> Ri
         rotation=turn @ part_from_camera.rotation,
         translation=np.einsum("hij,hj->hi", turn, arm) + part.center + delta[:, 3:],
     )
-
-
-def _batch(poses: RigidTransform) -> tuple[int, ...]:
-    return poses.rotation.shape[:-2]
 
 
 def _jacobian(x: np.ndarray, normals: np.ndarray, out: np.ndarray) -> np.ndarray:

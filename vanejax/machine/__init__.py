@@ -1,9 +1,8 @@
 """From a pose to what a machine takes.
 
 In: poses of a part and of the camera. Out: pose files, work frames for controllers, compensated
-tool
-paths, motions between two registrations, the calibration of a camera to a machine; each with its
-errors.
+tool paths, motions between two registrations, the calibration of a camera to a machine; each with
+its errors.
 """
 
 from vanejax.machine.calibration import Calibration, calibrate

@@ -54,11 +54,6 @@ def write_matrix(machine_from_part: RigidTransform) -> str:
     )
 
 
-def read_matrix(text: str) -> RigidTransform:
-    """The frame of 16 numbers, row by row."""
-    return parse_transform(text, where="the matrix", target="machine", source="part")
-
-
 def write_kuka(machine_from_part: RigidTransform) -> str:
     """KUKA's FRAME {X, Y, Z, A, B, C}; see `vanejax.machine.pose_file.kuka_frame`."""
     frame = kuka_frame(machine_from_part)
@@ -211,7 +206,10 @@ def read_siemens(text: str) -> RigidTransform:
 
 NOTATIONS: Mapping[str, Notation] = {
     "matrix": Notation(
-        "4x4 matrix", "row by row, [x_machine, 1] = M [x_part, 1], mm", write_matrix, read_matrix
+        "4x4 matrix",
+        "row by row, [x_machine, 1] = M [x_part, 1], mm",
+        write_matrix,
+        lambda text: parse_transform(text, where="the matrix", target="machine", source="part"),
     ),
     "kuka": Notation(
         "KUKA frame",
