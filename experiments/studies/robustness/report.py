@@ -184,8 +184,8 @@ def picture(report: Report) -> Figure:
         shared[name].set_ylim(bottom=0)
     shared["translation_mm"].yaxis.set_major_formatter("{x:g}")
     shared["translation_mm"].text(
-        0.98, NEED_MM, f"need: {NEED_MM:g} mm", transform=grid[0, 0].get_yaxis_transform(),
-        ha="right", va="top", color=INK, fontsize=TICK_PT,
+        0.98, 1.4 * NEED_MM, f"need: {NEED_MM:g} mm", transform=grid[0, 0].get_yaxis_transform(),
+        ha="right", va="bottom", color=INK, fontsize=TICK_PT,
     )  # fmt: skip
     handles = {
         line.get_label(): line for axes in grid.flat for line in axes.lines
