@@ -20,11 +20,7 @@ from vanejax.rigid import RigidTransform
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CountedRays(RayCasting):
-    """A model that remembers how many rays it was asked to cast.
-
-    Attributes:
-      rays: of each call so far.
-    """
+    """A model that remembers how many ``rays`` each call so far asked it to cast."""
 
     rays: list[int] = dataclasses.field(default_factory=list)
 

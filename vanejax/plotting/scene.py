@@ -53,11 +53,7 @@ class Picture:
 
 
 class Scene:
-    """Draws one part from any side, with scans on it.
-
-    Args:
-      part: what is drawn.
-    """
+    """Draws one part from any side, with scans on it."""
 
     def __init__(self, part: Part) -> None:
         self.part = part

@@ -48,12 +48,7 @@ def shade(scan: Scan, camera: Camera) -> np.ndarray:
 
 
 def part_picture(scan: Scan, camera: Camera) -> Figure:
-    """The shaded part alone, cropped to what the camera sees of it.
-
-    Args:
-      scan: one view, with all its pixels.
-      camera: the one that made it.
-    """
+    """The shaded part alone, cropped to what the camera that made the scan sees of it."""
     image = shade(scan, camera)
     rows, columns = crop(scan, camera)
     wide = (columns.stop - columns.start) / camera.fx

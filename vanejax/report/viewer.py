@@ -26,7 +26,6 @@ from vanejax.scans import MeasuredScan
 MAX_VERTICES = 65_535
 MAX_POINTS = 60_000
 _NO_DEVIATION = -32768
-_MICROMETRES = 1000.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,7 +222,7 @@ def to_grid(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _micrometres(deviation_mm: np.ndarray) -> np.ndarray:
     """Deviations [n] mm in whole micrometres, cut at 32.767 mm; -32768 for none."""
-    whole = np.clip(np.round(_MICROMETRES * deviation_mm), -32767, 32767)
+    whole = np.clip(np.round(1000.0 * deviation_mm), -32767, 32767)
     return np.where(np.isnan(deviation_mm), _NO_DEVIATION, whole)
 
 
