@@ -147,17 +147,14 @@ def offset_directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     def product(blocks: np.ndarray, flat: np.ndarray) -> np.ndarray:
         return np.einsum("vij,vj->vi", blocks, flat.reshape(-1, 3))
 
+    def applied(flat: np.ndarray) -> np.ndarray:
+        return (product(local, flat) + smooth @ flat.reshape(-1, 3)).ravel()
+
     size = (start.size, start.size)
-    directions, _ = cg(
-        LinearOperator(
-            size, lambda flat: (product(local, flat) + smooth @ flat.reshape(-1, 3)).ravel()
-        ),
-        wanted.ravel(),
-        x0=start.ravel(),
-        rtol=1e-5,  # of the offset, which is below a millimetre
-        maxiter=500,
-        M=LinearOperator(size, lambda flat: product(inverse, flat).ravel()),
-    )
+    near = LinearOperator(size, lambda flat: product(inverse, flat).ravel())
+    # to 1e-5 of the offset, which is below a millimetre
+    options = {"x0": start.ravel(), "rtol": 1e-5, "maxiter": 500, "M": near}
+    directions, _ = cg(LinearOperator(size, applied), wanted.ravel(), **options)
     return directions.reshape(-1, 3)
 
 

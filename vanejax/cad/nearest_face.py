@@ -56,9 +56,8 @@ class NearestFace:
 
     def _nearest_of(self, points: np.ndarray) -> ClosestPoints:
         best = np.full(len(points), np.inf)
-        closest = ClosestPoints(
-            np.zeros((len(points), 3)), np.zeros((len(points), 3)), np.zeros(len(points), np.int64)
-        )
+        blank = np.zeros((2, len(points), 3))
+        closest = ClosestPoints(*blank, np.zeros(len(points), np.int64))
         for faces, tree in zip(self._sizes, self._trees, strict=True):
             largest = self._radii[faces].max()
             rows, first, last = np.arange(len(points)), 0, min(FIRST_FACES, len(faces))
@@ -98,9 +97,8 @@ class NearestFace:
         point = np.concatenate([point, known])
         foot = np.concatenate([foot, closest.points[known]])
         face = np.concatenate([face, closest.face[known]])
-        old = np.abs(
-            np.einsum("ni,ni->n", points[known] - closest.points[known], closest.normals[known])
-        )
+        off = points[known] - closest.points[known]
+        old = np.abs(np.einsum("ni,ni->n", off, closest.normals[known]))
         distance, facing = np.concatenate([distance, best[known]]), np.concatenate([facing, old])
         tied = np.flatnonzero(distance <= nearest[point] + TIE_MM)
         tied = tied[np.argsort(facing[tied], kind="stable")]  # the last one written stays

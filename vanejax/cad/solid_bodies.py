@@ -137,14 +137,9 @@ def outward_bodies(
     index = np.flatnonzero(solid)
     outermost = {}
     for i in index:
-        around = [
-            j
-            for j in index
-            if j != i
-            and np.all(low[j] <= low[i])
-            and np.all(high[i] <= high[j])
-            and _contains(pieces[j], mesh.points[pieces[i].faces[0, 0]])
-        ]
+        boxes = np.all((low <= low[i]) & (high[i] <= high), axis=1)
+        point = mesh.points[pieces[i].faces[0, 0]]
+        around = [j for j in index if j != i and boxes[j] and _contains(pieces[j], point)]
         outermost[i] = max(around, key=lambda j: abs(volume[j]), default=None)
     # an inside-out body turns with all that is inside it: its cavities stay cavities
     root = {i: i if outermost[i] is None else outermost[i] for i in index}

@@ -152,16 +152,12 @@ def near_symmetries(
     tried: list[np.ndarray] = []
 
     def is_new(matrix: np.ndarray, known: list[np.ndarray], angle_deg: float) -> bool:
+        frame = {"center": part.center, "radius_mm": part.radius}
+        poses = map(RigidTransform.from_matrix, [matrix, *known])
+        pose = next(poses)
         errors = (
-            pose_error(
-                RigidTransform.from_matrix(matrix),
-                RigidTransform.from_matrix(other),
-                symmetries,
-                center=part.center,
-                radius_mm=part.radius,
-                continuous_axis=continuous_axis,
-            )
-            for other in known
+            pose_error(pose, other, symmetries, continuous_axis=continuous_axis, **frame)
+            for other in poses
         )
         return all(e[0] > angle_deg or e[1] > SAME_SHIFT * part.radius for e in errors)
 
@@ -171,15 +167,13 @@ def near_symmetries(
     every = _candidates(part) if more is None else np.concatenate([_candidates(part), more])
     for matrix in every:
         # what is far off before the polish will not come near enough by it
-        if surface.mismatch_mm(matrix, SCREENED_POINTS) > 3 * limit:
-            continue
-        if not is_new(matrix, [np.eye(4), *tried], 1.0):
+        far_off = surface.mismatch_mm(matrix, SCREENED_POINTS) > 3 * limit
+        if far_off or not is_new(matrix, [np.eye(4), *tried], 1.0):
             continue
         tried.append(matrix)
         matrix = min(matrix, surface.polish(matrix), key=coarse)
-        if coarse(matrix) > 1.5 * limit:
-            continue
-        if not is_new(matrix, [np.eye(4), *(m for _, m in near)], 1.0):
+        far_off = coarse(matrix) > 1.5 * limit
+        if far_off or not is_new(matrix, [np.eye(4), *(m for _, m in near)], 1.0):
             continue
         # it may still be on its way to a better one
         matrix = min(matrix, surface.polish(matrix), key=coarse)

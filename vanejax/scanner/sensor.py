@@ -134,10 +134,8 @@ class Sensor:
         if self.exposure is None:
             return self
         factor = (distance_mm / REFERENCE_MM) ** 2
-        exposure = dataclasses.replace(
-            self.exposure, exposure_ms=factor * self.exposure.exposure_ms
-        )
-        return dataclasses.replace(self, exposure=exposure)
+        longer = dataclasses.replace(self.exposure, exposure_ms=factor * self.exposure.exposure_ms)
+        return dataclasses.replace(self, exposure=longer)
 
     def sample(self, rng: np.random.Generator, *, spread: float = 0.3) -> Sensor:
         """Another camera of this kind, as its maker's next one would be.
@@ -218,13 +216,7 @@ def consumer_depth() -> Sensor:
     width, height, focal = 424, 240, 212.945
     opening = [math.degrees(2 * math.atan(size / (2 * focal))) for size in (width, height)]
     return Sensor(
-        camera=Camera(
-            width=width,
-            height=height,
-            fov_x_deg=opening[0],
-            fov_y_deg=opening[1],
-            near_mm=50.0,
-        ),
+        camera=Camera(width, height, *opening, near_mm=50.0),
         baseline_mm=18.0,
         shadow=True,
         max_incidence_deg=76.0,

@@ -48,14 +48,7 @@ class Reason(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SensedView:
-    """An ideal scan of N pixels, and the sensor that measures it.
-
-    Attributes:
-      scanner: that made the scan: it casts the shadows.
-      scan: by the sensor's camera.
-      sensor: with its magnitudes.
-      rng: of all that is random.
-    """
+    """An ideal scan of N pixels by the sensor's camera, the scanner that made it, and chance."""
 
     scanner: Scanner
     scan: Scan
@@ -90,9 +83,8 @@ class SensedView:
             return modulation, modulation
         lamp = np.float32(exposure.ambient_towards)
         lamp /= np.linalg.norm(lamp)
-        return modulation, modulation + exposure.ambient(
-            exposure.reflected(normals, to_camera, lamp)
-        )
+        ambient = exposure.ambient(exposure.reflected(normals, to_camera, lamp))
+        return modulation, modulation + ambient
 
 
 # Dropouts: which of the N pixels measure nothing, [N] bool.
@@ -223,9 +215,8 @@ def outliers(view: SensedView, kept: np.ndarray, depth: np.ndarray) -> np.ndarra
         return None
     wrong = np.flatnonzero(rng.random(len(kept), dtype=np.float32) < sensor.outlier_rate)
     depth = depth.copy()
-    depth[wrong] += np.float32(sensor.outlier_mm) * (
-        2 * rng.random(len(wrong), dtype=np.float32) - 1
-    )
+    side = 2 * rng.random(len(wrong), dtype=np.float32) - 1
+    depth[wrong] += np.float32(sensor.outlier_mm) * side
     return depth
 
 
