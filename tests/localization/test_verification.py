@@ -110,13 +110,9 @@ def test_a_wrong_pose_is_found_out(seen, right, name):
     assert found.inlier_share < 0.35
     assert found.violation_share + (found.status == PointStatus.BEFORE).mean() > 0.2
     assert found.score < 0.3 < right.score
-    judged = evidence(
-        model(vane()),
-        batch(truth, wrong),
-        points,
-        tolerance_mm=TOLERANCE,
-        view=View(points, ORIGIN),
-    )
+    view = View(points, ORIGIN)
+    poses = batch(truth, wrong)
+    judged = evidence(model(vane()), poses, points, tolerance_mm=TOLERANCE, view=view)
     assert judged.preference(0, 1) > 10
     assert judged.total[0] == pytest.approx(right.score)
 
@@ -286,17 +282,9 @@ def test_a_small_feature_tells_two_poses_apart():
     scan, truth = ideal_scan(part, view, MIDDLE)
     points = with_noise(exact_points(part, scan), 0.05, 0)
     turned = motion(part, [0, 0, 180], [0, 0, 0]) @ truth
-    judged = evidence(
-        model(part), batch(truth, turned), points, tolerance_mm=0.2, view=View(points, ORIGIN)
-    )
-    other = verify(
-        model(part),
-        turned,
-        points,
-        np.arange(len(points)),
-        tolerance_mm=0.2,
-        view=View(points, ORIGIN),
-    )
+    sides, every = View(points, ORIGIN), np.arange(len(points))
+    judged = evidence(model(part), batch(truth, turned), points, tolerance_mm=0.2, view=sides)
+    other = verify(model(part), turned, points, every, tolerance_mm=0.2, view=sides)
     assert other.inlier_share > 0.95
     assert judged.preference(0, 1) > 4  # `Limits.least_preference`
 

@@ -312,12 +312,8 @@ def _inspect_arrays(path: Path, arrays: dict[str, str]) -> Inspection:
     shown = [f"{name}: {shape}" for name, shape in list(arrays.items())[:20]]
     if len(arrays) > len(shown):
         shown.append(f"and {len(arrays) - len(shown)} more arrays")
-    return _inspection(
-        path,
-        "arrays",
-        "NumPy archive",
-        notes=(*shown, "a scan would have an array 'points' or 'xyz'"),
-    )
+    notes = (*shown, "a scan would have an array 'points' or 'xyz'")
+    return _inspection(path, "arrays", "NumPy archive", notes=notes)
 
 
 def _array_names(path: Path) -> dict[str, str]:

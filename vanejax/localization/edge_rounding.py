@@ -59,12 +59,7 @@ def without_rounding(
       part_from_camera: about right.
     """
     camera = sensor.camera
-    window = Sensor(
-        camera=camera,
-        baseline_mm=sensor.baseline_mm,
-        window_px=sensor.window_px,
-        jump_mm=sensor.jump_mm,
-    )
+    window = Sensor(camera, sensor.baseline_mm, window_px=sensor.window_px, jump_mm=sensor.jump_mm)
     rng = np.random.default_rng(0)  # nothing random is left in it
     seen = measure(scanner, window, part_from_camera.inverse(), rng)
     factor = np.ones(camera.height * camera.width)
