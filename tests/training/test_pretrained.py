@@ -11,15 +11,13 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cad import Part, guide_vane, part_from_mesh
 from vanejax.cli.program import main
 from vanejax.errors import InputError
 from vanejax.localization.matched_poses import match_poses
 from vanejax.localization.registration import register
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera, hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Camera, Scanner, hemisphere_viewpoints
 from vanejax.scans.measured_scan import MeasuredScan
 from vanejax.training.pretrained import find_weights, pretrained_matcher
 from vanejax.training.weight_file import TrainedMatcher

@@ -15,9 +15,7 @@ from hypothesis import strategies as st
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.pointcloud import PointCloud
-from vanejax.scanner.camera import Camera
-from vanejax.scanner.sensor import Sensor, preset
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Camera, Scanner, Sensor, preset
 from vanejax.training.online_scans import RandomViews, ScanStream
 from vanejax.training.pairs import PairSampling, draw_pairs
 

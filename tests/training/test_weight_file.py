@@ -21,10 +21,8 @@ from experiments.runner.run_folder import RunFolder
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.files import read_arrays, write_arrays
-from vanejax.training.checkpoint import Checkpoints
-from vanejax.training.dataset import ScanSet, make_scan_set
+from vanejax.training import Checkpoints, ScanSet, TrainState, make_optimizer, make_scan_set
 from vanejax.training.export import export_workdir
-from vanejax.training.train_step import TrainState, make_optimizer
 from vanejax.training.weight_file import (
     TrainedMatcher,
     abstract_variables,

@@ -16,9 +16,7 @@ from vanejax.errors import InputError
 from vanejax.files import read_versioned_arrays, write_arrays
 from vanejax.pointcloud import voxel_thin
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera, Viewpoints
-from vanejax.scanner.ideal_scan import Scan
-from vanejax.scanner.viewpoint_scans import scan_views
+from vanejax.scanner import Camera, Scan, Viewpoints, scan_views
 
 FORMAT = "vanejax scan set"
 VERSION = 1

@@ -7,9 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from vanejax.matching import pose_metrics, weighted_procrustes
 from vanejax.matching.baselines.dcp import Dcp, Embedding, Match
-from vanejax.matching.metrics import pose_metrics
-from vanejax.matching.procrustes import weighted_procrustes
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.settings import Settings, factor, not_negative, positive, settings_class

@@ -17,15 +17,11 @@ from contextlib import contextmanager
 import jax.numpy as jnp
 import numpy as np
 
-from vanejax.cad.investment_casting import InvestmentCasting, as_cast
-from vanejax.cad.part import Part
+from vanejax.cad import InvestmentCasting, Part, as_cast
 from vanejax.errors import InputError
 from vanejax.pointcloud import PointCloud, voxel_thin
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import look_at
-from vanejax.scanner.measurement import measure
-from vanejax.scanner.sensor import Sensor, preset
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Scanner, Sensor, look_at, measure, preset
 from vanejax.scans.normals import estimate_normals
 from vanejax.settings import Settings, bounded, not_negative, positive, settings_class, share
 from vanejax.training.dataset import ScanSet

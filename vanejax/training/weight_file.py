@@ -16,8 +16,7 @@ import jax
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vanejax.cad.nearest_face import NearestFace
-from vanejax.cad.part import Part
+from vanejax.cad import NearestFace, Part
 from vanejax.errors import InputError
 from vanejax.files import read_versioned_arrays, write_arrays
 from vanejax.matching.rpmnet import RpmNet
