@@ -1,9 +1,8 @@
 """From two point clouds to a pose, in pure JAX.
 
 In: source and target as `PointCloud`s in unit-sphere units, a pose to start from. Out: a
-`Registration`
-with ``target_from_source``. `RpmNet` is the paper's network; `vanejax.matching.baselines` has the
-methods that it is compared with.
+`Registration` with ``target_from_source``. `RpmNet` is the paper's network;
+`vanejax.matching.baselines` has the methods that it is compared with.
 """
 
 from vanejax.matching.contract import Register, Registration
