@@ -316,6 +316,7 @@ def test_which_values_want_a_logarithmic_axis(values, wanted: bool) -> None:
     assert ablation_picture.geometric(values) is wanted
 
 
+@pytest.mark.slow
 def test_two_cells_from_scans_to_picture(tmp_path, capsys, hasty_compiler) -> None:
     config = tiny_experiment()
     config.training.steps = 2

@@ -145,6 +145,7 @@ def test_divergence_stops_and_keeps_the_last_good_checkpoint(tmp_path, capsys) -
             assert np.isfinite(value).all(), name
 
 
+@pytest.mark.slow
 def test_a_budget_ends_a_run_for_good(tmp_path) -> None:
     workdir, config = tmp_path / "short", tiny_experiment()
     config.training.budget_minutes = 0.0001

@@ -346,6 +346,7 @@ def masked(text: str) -> list[str]:
 LONG = ("register scan.ply block.stl", "experiments.", "export", "--weights", "pip", "venv")
 
 
+@pytest.mark.slow
 def test_the_quick_start_runs_as_written(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("VANEJAX_CACHE_DIR", "off")

@@ -148,6 +148,7 @@ def outcome(request):
     return request.param, pairs, value_and_grad(model, loss, variables(request.param), pairs)
 
 
+@pytest.mark.slow
 def test_the_loss_is_its_slow_twin(outcome):
     name, pairs, ((value, metrics), _) = outcome
     expected, parts = plain(name, variables(name), pairs)

@@ -38,6 +38,7 @@ def report(folder: Path, hasty_compiler) -> dict:
     return public_vs_virtual(small(), folder, {}, progress=False)
 
 
+@pytest.mark.slow
 def test_both_are_trained_and_tested_on_the_same_views(report: dict, folder: Path) -> None:
     assert report["views"] == {"all": 4, "hardest": 2}
     assert "solids" in report["trained_on"]["public"]["title"]
@@ -53,6 +54,7 @@ def test_both_are_trained_and_tested_on_the_same_views(report: dict, folder: Pat
         assert (folder / name).stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_reduction_is_that_of_the_means(report: dict) -> None:
     for views, count in (("all_views", 4), ("hardest_views", 2)):
         errors = report[views]
@@ -82,6 +84,7 @@ def test_without_shapes_there_is_nothing_to_compare(tmp_path: Path) -> None:
         public_vs_virtual(config, tmp_path, {})
 
 
+@pytest.mark.slow
 def test_a_run_begun_with_other_shapes_is_refused(report: dict, folder: Path) -> None:
     config = small()
     record = json.loads((folder / "public" / "run.json").read_text())

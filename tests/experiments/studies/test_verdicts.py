@@ -210,6 +210,7 @@ def test_what_is_reported() -> None:
     picture(report).canvas.draw()
 
 
+@pytest.mark.slow
 def test_the_study_runs(tmp_path: Path, capsys) -> None:
     arguments = ["--parts", "box,wedge", "--sensors", "white", "--out", str(tmp_path)]
     report = main(make_parser().parse_args(arguments))
