@@ -6,6 +6,7 @@ import base64
 import html
 import json
 import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -153,7 +154,8 @@ def test_a_frame_in_a_page_is_drawn_too(browser, view, tmp_path):
     frame = view._repr_html_()
     path.write_text(f"<!doctype html><link rel=icon href='data:,'><body style='margin:0'>{frame}")
     browser.open(path, width=900, height=560)
-    for _ in range(100):  # the frame loads on its own
+    for _ in range(100):  # the frame loads on its own, slowly where the machine is busy
+        time.sleep(0.1)
         difference = np.abs(shot(browser) - alone).max(axis=-1) > 0.1
         if difference.mean() < 1e-3:
             break
