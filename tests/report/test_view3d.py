@@ -147,6 +147,18 @@ def test_a_scan_is_drawn_in_both_colours(browser, view, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_view_that_changes_its_size_still_fits(browser, view, tmp_path):
+    """A frame may be loaded before it has its size."""
+    alone = opened(browser, view, tmp_path)
+    browser.evaluate("document.querySelector('canvas').style.width = '60px'")
+    browser.settle()
+    browser.evaluate("document.querySelector('button[data-reset]').click()")
+    assert np.abs(shot(browser) - alone).max() > 0.1
+    browser.evaluate("document.querySelector('canvas').style.width = ''")
+    np.testing.assert_allclose(shot(browser), alone, atol=0.02)
+
+
+@pytest.mark.slow
 def test_a_frame_in_a_page_is_drawn_too(browser, view, tmp_path):
     """As in a notebook: sandboxed, from srcdoc, and without a request."""
     alone = opened(browser, view, tmp_path)

@@ -132,10 +132,19 @@
   const aspect = () => canvas.clientWidth / Math.max(1, canvas.clientHeight);
   // the slope of the upper edge of what is seen; a narrow view sees as much to the sides
   const slope = () => TANGENT / Math.min(1, aspect() || 1);
-  function reset() {
+  // the distance at which the part fills the view; a view may get its size after it is loaded
+  function fitted() {
     const [x, y, z] = scene.half_mm;
-    const distance = 1.08 * Math.max(y, x / (aspect() || 1)) / slope() + 0.5 * z;
+    return 1.08 * Math.max(y, x / (aspect() || 1)) / slope() + 0.5 * z;
+  }
+  function reset() {
+    const distance = (state.fitted = fitted());
     Object.assign(state, { distance, x: 0, y: 0, rotation: scene.view.slice() });
+  }
+  function resize() {
+    state.distance *= fitted() / state.fitted;
+    state.fitted = fitted();
+    redraw();
   }
 
   function product(a, b) {
@@ -296,7 +305,7 @@
   figure.querySelector("button[data-reset]").addEventListener("click", () => { reset(); redraw(); });
   canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
   canvas.addEventListener("webglcontextrestored", () => { upload(); redraw(); });
-  new ResizeObserver(redraw).observe(canvas);
+  new ResizeObserver(resize).observe(canvas);
 
   upload();
   document.body.dataset.viewer = "ready"; // the canvas has a size from here on
