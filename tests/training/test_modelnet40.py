@@ -52,7 +52,9 @@ def off_tree(tmp_path: Path) -> Path:
 
 def test_off_meshes_become_samples_in_the_unit_sphere(off_tree: Path):
     found = read(off_tree / "ModelNet40")
-    assert (found.layout, found.split_size) == ("OFF", 8)
+    assert found.title == (
+        "ModelNet40 (OFF), train split, all categories: 8 shapes of 8, where 9843 are published"
+    )
     assert found.names[:3] == ["airplane_0001", "airplane_0002", "lamp_0001"]
     assert found.samples.shape == (8, 64, 6)
     assert found.samples.dtype == np.float32
@@ -78,11 +80,9 @@ def test_halves_are_rpm_net_s_also_in_a_partial_copy(off_tree: Path):
     first, last = read(off_tree, categories="first 20"), read(off_tree, categories="last 20")
     assert first.names == ["airplane_0001", "airplane_0002", "lamp_0001", "lamp_0002"]
     assert last.names == ["laptop_0001", "laptop_0002", "xbox_0001", "xbox_0002"]
-    assert first.split_size == last.split_size == 8
-    assert read(off_tree, split="test", categories="first 20").names == [
-        "airplane_0003",
-        "lamp_0003",
-    ]
+    assert "first 20 categories: 4 shapes of 8," in first.title
+    test = read(off_tree, split="test", categories="first 20")
+    assert test.names == ["airplane_0003", "lamp_0003"]
 
 
 def test_headers_that_run_into_the_counts_are_read(tmp_path: Path):
@@ -134,15 +134,18 @@ def test_broken_off_files_are_refused(tmp_path: Path, text: str, message: str):
         read_off(path)
 
 
-def test_what_is_not_there(tmp_path: Path):
-    with pytest.raises(InputError, match=r"no such folder\. Obtain modelnet40_ply.*nothing is dow"):
-        read(tmp_path / "nowhere")
-    with pytest.raises(InputError, match="holds no ModelNet40"):
-        read(tmp_path)
-    with pytest.raises(InputError, match="no split 'validation'"):
-        read(tmp_path, split="validation")
-    with pytest.raises(InputError, match="no categories '20'"):
-        read(tmp_path, categories="20")
+@pytest.mark.parametrize(
+    ("folder", "settings", "message"),
+    [
+        ("nowhere", {}, r"no such folder\. Obtain modelnet40_ply.*nothing is downloaded"),
+        ("", {}, "holds no ModelNet40"),
+        ("", {"split": "validation"}, "no split 'validation'"),
+        ("", {"categories": "20"}, "no categories '20'"),
+    ],
+)
+def test_what_is_not_there(tmp_path: Path, folder: str, settings: dict, message: str):
+    with pytest.raises(InputError, match=message):
+        read(tmp_path / folder, **settings)
 
 
 def test_hdf5_without_h5py_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -176,29 +179,13 @@ def hdf5_folder(tmp_path: Path) -> Path:
     return folder
 
 
-def rewrite(folder: Path, **datasets: np.ndarray | None) -> None:
-    """Replaces or removes datasets of the first training file."""
-    import h5py
-
-    with h5py.File(folder / "ply_data_train0.h5", "a") as file:
-        for name, values in datasets.items():
-            del file[name]
-            if values is not None:
-                file[name] = values
-
-
 def test_hdf5_shapes_are_read_as_stored_in_the_listed_order(hdf5_folder: Path):
     import h5py
 
     found = read(hdf5_folder, num_points=4096)
-    assert (found.layout, found.split_size) == ("HDF5", 5)
-    expected = [
-        "laptop train 0",
-        "lamp train 1",
-        "xbox train 2",
-        "airplane train 3",
-        "lamp train 4",
-    ]
+    assert found.title.startswith("ModelNet40 (HDF5), train split, all categories: 5 shapes of 5,")
+    categories = ["laptop", "lamp", "xbox", "airplane", "lamp"]
+    expected = [f"{name} train {place}" for place, name in enumerate(categories)]
     assert found.names == expected
     with h5py.File(hdf5_folder / "ply_data_train0.h5") as file:
         np.testing.assert_array_equal(found.samples[2:, :, :3], file["data"])
@@ -213,7 +200,7 @@ def test_hdf5_halves_and_splits(hdf5_folder: Path):
     every = read(hdf5_folder)
     first = read(hdf5_folder, categories="first 20")
     assert first.names == ["lamp train 1", "airplane train 3", "lamp train 4"]
-    assert first.split_size == 5
+    assert "3 shapes of 5," in first.title
     assert read(hdf5_folder, split="test").names == ["airplane test 0"]
     with pytest.raises(InputError, match="no test shapes of the last 20"):
         read(hdf5_folder, split="test", categories="last 20")
@@ -251,19 +238,19 @@ def test_broken_hdf5_folders_are_refused(hdf5_folder: Path):
             {k: np.zeros((3, 9, 3), np.float32) for k in ("data", "normal")},
             "different numbers of points",
         ),
+        ({"data": (2**40, 100, 3)}, "announces"),  # a promise of more than memory holds
     ],
 )
 def test_broken_hdf5_datasets_are_refused(hdf5_folder: Path, datasets, message: str):
-    rewrite(hdf5_folder, **datasets)
-    with pytest.raises(InputError, match=message):
-        read(hdf5_folder)
-
-
-def test_a_promise_of_more_than_memory_holds_is_refused(hdf5_folder: Path):
+    """Datasets of the first training file are replaced, removed, or only announced by a shape."""
     import h5py
 
     with h5py.File(hdf5_folder / "ply_data_train0.h5", "a") as file:
-        del file["data"]
-        file.create_dataset("data", (2**40, 100, 3), "f4", compression="gzip")
-    with pytest.raises(InputError, match="announces"):
+        for name, values in datasets.items():
+            del file[name]
+            if isinstance(values, tuple):
+                file.create_dataset(name, values, "f4", compression="gzip")
+            elif values is not None:
+                file[name] = values
+    with pytest.raises(InputError, match=message):
         read(hdf5_folder)

@@ -22,6 +22,7 @@ from vanejax.training.pairs import PairSampling, draw_pairs
 CENTER = np.array([30.0, -20.0, 10.0])
 HALF = np.array([40.0, 25.0, 15.0])
 BOX_CAMERA = Camera(width=160, height=128, near_mm=100.0)
+SAMPLING = PairSampling(num_reference=256, num_source=200, noise=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +45,7 @@ def stream(box) -> ScanStream:
         views=RandomViews(),
         castings=[Scanner(box)],
         batch_size=3,
-        num_reference=256,
-        num_source=200,
+        sampling=SAMPLING,
         voxel_mm=4.0,
         seed=7,
     )
@@ -58,7 +58,7 @@ def off_the_box_mm(points: np.ndarray, part: Part) -> np.ndarray:
 
 def test_points_lie_on_the_part_and_normals_stand_on_it(stream, box):
     points, normals = stream.scan(11)
-    assert 32 <= len(points) <= stream.num_source
+    assert 32 <= len(points) <= stream.sampling.num_source
     # float32 of 400 mm, there and back
     assert off_the_box_mm(points, box).max() < 2e-3
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
@@ -114,9 +114,8 @@ def test_validation_is_never_trained_on(stream):
 
 
 def test_every_step_has_the_same_shapes_and_compiles_once(stream):
-    sampling = PairSampling(num_reference=256, num_source=200, noise=0.0)
     # a function of its own: other tests jit `draw_pairs` too, and would share its cache
-    draw = jax.jit(lambda key, bank: draw_pairs(key, bank, jnp.arange(3), sampling))
+    draw = jax.jit(lambda key, bank: draw_pairs(key, bank, jnp.arange(3), SAMPLING))
     for step in range(3):
         pairs = draw(jax.random.key(step), stream.of_step(step))
         # the label takes every source back onto the part

@@ -14,7 +14,7 @@ from vanejax.errors import InputError
 from vanejax.matching.se3 import rotation_angle
 from vanejax.pointcloud import PointCloud
 from vanejax.training.pairs import Pair, PairSampling
-from vanejax.training.shape_pairs import ShapeBank, crop, draw_shape_pairs
+from vanejax.training.shape_pairs import ShapeBank, crop
 
 POINTS, WHOLE, ROWS, BATCH = 200, 100, 70, 3
 CLEAN = PairSampling(
@@ -38,17 +38,6 @@ def bank() -> ShapeBank:
 def pairs(index: int = 1, sampling: PairSampling = CLEAN, seed: int = 0) -> Pair:
     drawn = draw(bank(), jax.random.key(seed), jnp.array([index, 0, 2]), sampling)
     return jax.tree.map(np.asarray, drawn)
-
-
-def shapes_of(sampling: PairSampling, points: int, **options) -> Pair:
-    """A pair's shapes; nothing is compiled."""
-    zeros = jnp.zeros((1, points, 3))
-    return jax.eval_shape(
-        lambda key: draw_shape_pairs(
-            key, ShapeBank(zeros, zeros), jnp.int32(0), BATCH, sampling, **options
-        ),
-        jax.random.key(0),
-    )
 
 
 def in_target_frame(pair: Pair) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -155,20 +144,6 @@ def test_order_says_nothing():
     assert np.max(correlation / np.linalg.norm(centred, axis=0)) < 0.5
 
 
-def test_sizes():
-    published = shapes_of(PairSampling(), 2048)
-    assert published.source.xyz.shape == (BATCH, 717, 3)
-    assert published.source.mask.shape == (BATCH, 717)
-    assert published.target.xyz.shape == (717, 3)
-    assert published.target_from_source.rotation.shape == (BATCH, 3, 3)
-    whole = shapes_of(PairSampling(), 1024, crop_target=False)
-    assert whole.target.xyz.shape == (1024, 3)
-    assert whole.source.xyz.shape == (BATCH, 717, 3)
-    assert shapes_of(CLEAN, POINTS, keep=0.5).source.xyz.shape == (BATCH, 50, 3)
-    assert shapes_of(CLEAN, POINTS, keep=1.0).source.xyz.shape == (BATCH, WHOLE, 3)
-    assert bank().size == 3
-
-
 def test_both_clouds_are_noisy_and_the_label_is_not():
     noisy, clean = pairs(sampling=dataclasses.replace(CLEAN, noise=0.01)), pairs()
     jax.tree.map(np.testing.assert_array_equal, noisy.target_from_source, clean.target_from_source)
@@ -200,9 +175,19 @@ def test_the_same_key_gives_the_same_pairs_and_another_one_others():
     assert gaps.max(axis=(1, 2)).min() > 1e-3
 
 
-def test_what_cannot_be_drawn():
+def test_published_sizes():
+    """Nothing is compiled."""
+
+    def drawn(held: int) -> Pair:
+        shapes = ShapeBank(jnp.zeros((1, held, 3)), jnp.zeros((1, held, 3)))
+        entries = jnp.zeros(BATCH, jnp.int32)
+        return jax.eval_shape(lambda: shapes.draw(jax.random.key(0), entries, PairSampling()))
+
+    pair = drawn(1024)
+    assert pair.source.xyz.shape == (BATCH, 717, 3)
+    assert pair.source.mask.shape == (BATCH, 717)
+    assert pair.target.xyz.shape == (717, 3)
+    assert pair.target_from_source.rotation.shape == (BATCH, 3, 3)
     with pytest.raises(InputError, match="1023 points each, 1024 are wanted"):
-        shapes_of(PairSampling(), 1023)
-    for keep in (0.0, 1.5):
-        with pytest.raises(InputError, match="take 0 < keep <= 1"):
-            shapes_of(CLEAN, POINTS, keep=keep)
+        drawn(1023)
+    assert bank().size == 3

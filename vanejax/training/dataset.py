@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from vanejax.scanner import Camera, Scan, Viewpoints, scan_views
 
 FORMAT = "vanejax scan set"
 VERSION = 1
+_ARRAYS = ("points", "normals", "counts", "reference_points", "reference_normals", "center")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,26 +78,16 @@ class ScanSet:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes an .npz with a checksum; it appears complete or not at all."""
-        header = {
-            "format": FORMAT,
-            "version": VERSION,
-            "radius_mm": self.radius_mm,
-            "source": dict(self.source),
-        }
+        header = {"format": FORMAT, "version": VERSION}
+        header |= {"radius_mm": self.radius_mm, "source": dict(self.source)}
         write_arrays(path, self._arrays(), header)
 
     def _arrays(self) -> dict[str, np.ndarray]:
-        poses = self.viewpoints.camera_from_part
-        return {
-            "points": self.points,
-            "normals": self.normals,
-            "counts": self.counts,
+        """What a file holds, by name."""
+        return {name: getattr(self, name) for name in _ARRAYS} | {
             "elevation_deg": self.viewpoints.elevation_deg,
             "azimuth_deg": self.viewpoints.azimuth_deg,
-            "camera_from_part": poses.as_matrix(),
-            "reference_points": self.reference_points,
-            "reference_normals": self.reference_normals,
-            "center": self.center,
+            "camera_from_part": self.viewpoints.camera_from_part.as_matrix(),
         }
 
 
@@ -140,11 +131,7 @@ def make_scan_set(
         return scan.points[kept], scan.normals[kept]
 
     scans = scan_views(part, camera, viewpoints, transform=thin, progress=progress)
-    counts = np.array([len(points) for points, _ in scans], np.int32)
-    points, normals = np.zeros((2, len(scans), counts.max(), 3), np.float32)
-    for view, (xyz, normal) in enumerate(scans):
-        points[view, : len(xyz)] = xyz
-        normals[view, : len(xyz)] = normal
+    points, normals, counts = padded(scans, max(len(points) for points, _ in scans))
 
     # about 16 samples for each voxel that the surface crosses: hardly one is missed
     drawn = int(np.clip(16 * part.triangles.areas().sum() / voxel_mm**2, 1_000, 4_000_000))
@@ -166,6 +153,17 @@ def make_scan_set(
         radius_mm=part.radius,
         source=describe_source(part, camera, viewpoints, voxel_mm),
     )
+
+
+def padded(
+    clouds: Sequence[tuple[np.ndarray, np.ndarray]], rows: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points and normals of clouds as [V, rows, 3] f32, zero past their counts [V] i32."""
+    counts = np.array([len(points) for points, _ in clouds], np.int32)
+    both = np.zeros((2, len(clouds), rows, 3), np.float32)
+    for view, cloud in enumerate(clouds):
+        both[:, view, : counts[view]] = cloud
+    return both[0], both[1], counts
 
 
 def load_scan_set(
@@ -203,13 +201,8 @@ def _from_arrays(arrays: dict[str, np.ndarray], header: dict[str, Any], path: Pa
             camera_from_part=RigidTransform.from_matrix(arrays["camera_from_part"]),
         )
         scans = ScanSet(
-            points=arrays["points"],
-            normals=arrays["normals"],
-            counts=arrays["counts"],
+            **{name: arrays[name] for name in _ARRAYS},
             viewpoints=viewpoints,
-            reference_points=arrays["reference_points"],
-            reference_normals=arrays["reference_normals"],
-            center=arrays["center"],
             radius_mm=float(header["radius_mm"]),
             source=header["source"],
         )

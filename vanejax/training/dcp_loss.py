@@ -85,23 +85,18 @@ class DcpLoss(Settings):
     def __call__(self, model: Dcp, variables: Any, pairs: Pair) -> tuple[jax.Array, Metrics]:
         """Mean loss [] over a batch that shares its target, and mean metrics [].
 
-        Args:
-          model, variables: the network and its weights.
-          pairs: source [B, N], target_from_source [B], one target [M].
-
         Metrics: each part of the loss and the pose error.
         """
         # Once for the batch: the reference is the same for every view.
         embedding = model.apply(variables, pairs.target, method="embed")
 
-        def of_pair(
-            shared: tuple[Any, Embedding], source: PointCloud, truth: RigidTransform
-        ) -> tuple[jax.Array, Metrics]:
+        def of_pair(shared: tuple[Any, Embedding], pair: Pair) -> tuple[jax.Array, Metrics]:
             variables, embedding = shared
             init = jax.tree.map(jnp.asarray, RigidTransform.identity())
-            match = model.apply(variables, source, pairs.target, embedding, init, method="match")
-            pair = Pair(source=source, target=pairs.target, target_from_source=truth)
+            match = model.apply(
+                variables, pair.source, pair.target, embedding, init, method="match"
+            )
             value, parts = self.of_match(match, pair)
-            return value, parts | pose_metrics(match.target_from_source, truth)
+            return value, parts | pose_metrics(match.target_from_source, pair.target_from_source)
 
         return mean_over_pairs(of_pair, (variables, embedding), pairs)

@@ -16,7 +16,7 @@ from vanejax.rigid import RigidTransform
 from vanejax.training.pairs import Pair
 
 Body = Callable[[Any, Any, Any], tuple[jax.Array, Any, Any]]
-OfPair = Callable[[Any, PointCloud, RigidTransform], tuple[jax.Array, dict[str, jax.Array]]]
+OfPair = Callable[[Any, Pair], tuple[jax.Array, dict[str, jax.Array]]]
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -84,7 +84,7 @@ def mean_over_pairs(
     """Mean loss [] and mean metrics [] over a batch that shares its target.
 
     Args:
-      of_pair: ``value, metrics = of_pair(shared, source, target_from_source)`` for one pair.
+      of_pair: ``value, metrics = of_pair(shared, pair)`` for one pair.
       shared: what the mean is differentiable in; see `sum_with_gradient`.
       pairs: sources and labels [B].
       pairs_at_once: pairs of the batch that are computed side by side: 1 suits the caches of a
@@ -94,10 +94,13 @@ def mean_over_pairs(
     at_once = math.gcd(batch, pairs_at_once)
 
     def of_group(shared: Any, carry: tuple[()], group: tuple) -> tuple[jax.Array, tuple[()], Any]:
+        def of_one(source: PointCloud, truth: RigidTransform) -> tuple[jax.Array, Any]:
+            return of_pair(shared, Pair(source, pairs.target, truth))
+
         if at_once == 1:
-            value, metrics = of_pair(shared, *jax.tree.map(lambda leaf: leaf[0], group))
+            value, metrics = of_one(*jax.tree.map(lambda leaf: leaf[0], group))
             return value, carry, metrics
-        values, metrics = jax.vmap(of_pair, in_axes=(None, 0, 0))(shared, *group)
+        values, metrics = jax.vmap(of_one)(*group)
         return jnp.sum(values), carry, metrics
 
     groups = jax.tree.map(

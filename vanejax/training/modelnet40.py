@@ -6,9 +6,9 @@ trained on the first 20 of its 40 categories and tested on the other 20.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -32,25 +32,21 @@ LAST_OF_FIRST_20 = "lamp"  # the next is the laptop: so the half is the same in 
 MAX_NUMBERS = 2**29  # of one HDF5 dataset, 4 bytes each: a compressed file may promise any size
 MAX_BYTES = 2**29  # of an OFF file; the largest published one has 36 MB
 
+_Read = tuple[np.ndarray, list[str], int]  # samples, names, and shapes of the split, all categories
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class ModelNet40:
-    """Some shapes of ModelNet40.
 
-    Attributes:
-      samples: [S, P, 6] f32, points in the unit sphere and unit normals. From HDF5 as they are
-        stored (about the mean of the points), from OFF about the middle of the bounding box. A
-        normal is its face's, and the meshes' faces may look either way.
-      names: [S], ``airplane_0001`` from OFF, ``airplane train 0`` (place in the split) from HDF5.
-      layout: "HDF5" or "OFF".
-      split_size: shapes that the split has here, all categories; `PUBLISHED` says how many it
-        should have.
+class ModelNet40(NamedTuple):
+    """Some shapes of ModelNet40: samples [S, P, 6] f32, names [S], and how they are called.
+
+    Points lie in the unit sphere: from HDF5 as they are stored (about the mean of the points), from
+    OFF about the middle of the bounding box. A normal [3:] is its face's, of unit length; the
+    meshes' faces may look either way. Names are ``airplane_0001`` from OFF, ``airplane train 0``
+    (place in the split) from HDF5.
     """
 
     samples: np.ndarray
     names: list[str]
-    layout: str
-    split_size: int
+    title: str
 
 
 def read_modelnet40(
@@ -74,9 +70,21 @@ def read_modelnet40(
         raise InputError(f"no categories {categories!r} of ModelNet40; there are {CATEGORIES}")
     for place in (folder, folder / HDF5_FOLDER, folder / OFF_FOLDER):
         if any(place.glob("ply_data_*.h5")) or (place / f"{split}_files.txt").is_file():
-            return _read_hdf5(place, split, categories, seed, num_points)
-        if any(place.glob("*/*/*.off")):
-            return _read_off_tree(place, split, categories, seed, num_points)
+            layout, found = "HDF5", _read_hdf5(place, split, categories)
+        elif any(place.glob("*/*/*.off")):
+            layout, found = "OFF", _read_off_tree(place, split, categories, seed, num_points)
+        else:
+            continue
+        samples, names, size = found
+        if not names:
+            raise InputError(f"{place}: holds no {split} shapes of the {categories} categories")
+        published = PUBLISHED[layout, split]
+        whole = "as published" if size == published else f"where {published} are published"
+        title = (
+            f"ModelNet40 ({layout}), {split} split, {categories} categories: {len(names)} "
+            f"shapes of {size}, {whole}"
+        )
+        return ModelNet40(thinned(samples, num_points, seed), names, title)
     problem = "holds no ModelNet40" if folder.is_dir() else "there is no such folder"
     raise InputError(
         f"{folder}: {problem}. Obtain {HDF5_FOLDER}.zip (point clouds, published with PointNet) or "
@@ -90,7 +98,7 @@ def _is_chosen(category: str, categories: str) -> bool:
     return {"first 20": first, "last 20": not first, "all": True}[categories]
 
 
-def _read_hdf5(folder: Path, split: str, categories: str, seed: int, num_points: int) -> ModelNet40:
+def _read_hdf5(folder: Path, split: str, categories: str) -> _Read:
     categories_file = folder / "shape_names.txt"
     if not categories_file.is_file():
         raise InputError(f"{categories_file}: missing; it names the categories of the labels")
@@ -105,10 +113,7 @@ def _read_hdf5(folder: Path, split: str, categories: str, seed: int, num_points:
         size += len(data)
     if len({part.shape[1] for part in samples}) > 1:
         raise InputError(f"{folder}: the files hold different numbers of points for a shape")
-    if not names:
-        raise InputError(f"{folder}: holds no {split} shapes of the {categories} categories")
-    together = np.concatenate(samples)
-    return ModelNet40(thinned(together, num_points, seed), names, "HDF5", size)
+    return np.concatenate(samples), names, size
 
 
 def _hdf5_files(folder: Path, split: str) -> list[Path]:
@@ -171,14 +176,10 @@ def thinned(samples: np.ndarray, num_points: int, seed: int) -> np.ndarray:
     return np.stack([shape[rng.permutation(held)[:num_points]] for shape in samples])
 
 
-def _read_off_tree(
-    folder: Path, split: str, categories: str, seed: int, num_points: int
-) -> ModelNet40:
+def _read_off_tree(folder: Path, split: str, categories: str, seed: int, num_points: int) -> _Read:
     # beside a mesh, an archive made on a Mac has a file of its own, such as ._lamp_0001.off
     files = sorted(p for p in folder.glob(f"*/{split}/*.off") if not p.name.startswith("."))
     kept = [path for path in files if _is_chosen(path.parents[1].name, categories)]
-    if not kept:
-        raise InputError(f"{folder}: holds no {split} shapes of the {categories} categories")
     samples = np.empty((len(kept), num_points, 6), np.float32)
     for row, path in zip(samples, kept, strict=True):
         part = read_off(path)
@@ -186,7 +187,7 @@ def _read_off_tree(
         own = hashlib.sha256(f"{seed} {path.stem}".encode()).digest()[:8]
         points, normals, _ = part.sample(num_points, seed=int.from_bytes(own))
         row[:, :3], row[:, 3:] = (points - part.center) / part.radius, normals
-    return ModelNet40(samples, [path.stem for path in kept], "OFF", len(files))
+    return samples, [path.stem for path in kept], len(files)
 
 
 def read_off(path: Path) -> Part:

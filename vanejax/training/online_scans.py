@@ -24,7 +24,7 @@ from vanejax.rigid import RigidTransform
 from vanejax.scanner import Scanner, Sensor, look_at, measure, preset
 from vanejax.scans.normals import estimate_normals
 from vanejax.settings import Settings, bounded, not_negative, positive, settings_class, share
-from vanejax.training.dataset import ScanSet
+from vanejax.training.dataset import ScanSet, padded
 from vanejax.training.pairs import PairSampling, ScanBank, make_bank
 
 # more than a log interval: the loop runs ahead of the device between two looks at its metrics
@@ -102,11 +102,6 @@ class OnlineScans(RandomViews):
         if self.sensor:
             preset(self.sensor)
 
-    def make_sensor(self) -> Sensor:
-        """The sensor, or an ideal camera in its place; at full resolution."""
-        sensor = preset(self.sensor)
-        return sensor if self.effects else Sensor(camera=sensor.camera)
-
     def make_parts(self, part: Part, seed: int) -> list[Part]:
         """The parts that are scanned: the CAD model, or castings of it."""
         if not self.casting_mm:
@@ -120,15 +115,17 @@ class OnlineScans(RandomViews):
         self, part: Part, scans: ScanSet, sampling: PairSampling, *, batch_size: int, seed: int
     ) -> ScanStream:
         """The stream of scans, with the thinned surface and the voxels of ``scans``."""
+        sensor = preset(self.sensor)
+        if not self.effects:
+            sensor = Sensor(camera=sensor.camera)
         return ScanStream(
             part=part,
             reference=make_bank(scans, num_reference=sampling.num_reference).reference,
-            sensor=self.make_sensor().scaled(self.resolution),
+            sensor=sensor.scaled(self.resolution),
             views=self,
             castings=[Scanner(casting) for casting in self.make_parts(part, seed)],
             batch_size=batch_size,
-            num_reference=sampling.num_reference,
-            num_source=sampling.num_source,
+            sampling=sampling,
             voxel_mm=float(scans.source["voxel_mm"]),
             seed=seed,
         )
@@ -156,8 +153,7 @@ class ScanStream:
       castings: scanners of the parts that are scanned, by turns: the CAD model's own, or castings
         that differ from it.
       batch_size: B, scans in a step.
-      num_reference, num_source: M points of the reference and rows N of a source, as in
-        `vanejax.training.pairs.PairSampling`; a scan has M X / Y points, at most N.
+      sampling: a scan has M X / Y points, at most N, its ``num_reference`` and ``num_source``.
       voxel_mm: thinning, as that of the reference.
       seed: of everything.
     """
@@ -168,8 +164,7 @@ class ScanStream:
     views: RandomViews
     castings: Sequence[Scanner]
     batch_size: int
-    num_reference: int
-    num_source: int
+    sampling: PairSampling
     voxel_mm: float
     seed: int
 
@@ -192,8 +187,9 @@ class ScanStream:
             except InputError:  # the part is outside the image
                 continue
             thinned = voxel_thin(points, voxel_mm=self.voxel_mm)
-            wanted = round(self.num_reference * len(thinned) / self.reference.mask.shape[0])
-            wanted = min(wanted, self.num_source, len(thinned))
+            whole = self.reference.mask.shape[0]
+            wanted = round(self.sampling.num_reference * len(thinned) / whole)
+            wanted = min(wanted, self.sampling.num_source, len(thinned))
             if wanted >= LEAST_POINTS:
                 break
         else:
@@ -210,14 +206,9 @@ class ScanStream:
 
     def bank(self, numbers: Sequence[int]) -> ScanBank:
         """The scans of these numbers, [B, N], on the device."""
-        shape = (len(numbers), self.num_source, 3)
-        xyz, normals = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        sizes = np.zeros(len(numbers), np.int32)
-        for row, number in enumerate(numbers):
-            points, directions = self.scan(number)
-            sizes[row] = len(points)
-            xyz[row, : len(points)], normals[row, : len(points)] = points, directions
-        mask = np.arange(self.num_source)[None, :] < sizes[:, None]
+        rows = self.sampling.num_source
+        xyz, normals, sizes = padded([self.scan(number) for number in numbers], rows)
+        mask = np.arange(rows)[None, :] < sizes[:, None]
         scans = PointCloud(jnp.asarray(xyz), jnp.asarray(normals), jnp.asarray(mask))
         return ScanBank(scans=scans, source_sizes=jnp.asarray(sizes), reference=self.reference)
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from vanejax.matching.baselines.pcrnet import PcrNet
-from vanejax.matching.baselines.pointnetlk import PointNetLK
+from vanejax.matching.baselines.pointnetlk import LucasKanadeSteps, PointNetLK
 from vanejax.matching.metrics import nearest_offsets, pose_metrics
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
@@ -24,8 +24,45 @@ from vanejax.training.pairs import Pair
 from vanejax.training.train_step import Metrics, Variables
 
 
+class _IterationsLoss(Settings):
+    """The discounted sum of the parts of a loss over the iterations of a network."""
+
+    iterations: int
+    discount: float
+    pairs_at_once: int
+
+    def of_iterations(self, steps: Any, pair: Pair) -> tuple[RigidTransform, Metrics]:
+        """The poses [I] that a network found for one pair, and the parts [I] of the loss."""
+        raise NotImplementedError
+
+    def __call__(
+        self, model: PointNetLK | PcrNet, variables: Variables, pairs: Pair
+    ) -> tuple[jax.Array, Metrics]:
+        """Mean loss [] over a batch that shares its target, and mean metrics [].
+
+        Metrics: each part of the loss and the pose error, all after the last iteration.
+        """
+        # once for the batch: PointNetLK's takes seven passes of the encoder and a pseudo-inverse
+        template = model.apply(variables, pairs.target, method="template")
+        last = jnp.arange(self.iterations - 1.0, -1.0, -1.0)
+
+        def of_pair(shared: Any, pair: Pair) -> tuple[jax.Array, Metrics]:
+            variables, template = shared
+            start = pair.source, pair.target, RigidTransform.identity()
+            steps = model.apply(variables, *start, self.iterations, template=template)
+            poses, parts = self.of_iterations(steps, pair)
+            per_iteration = sum(getattr(self, name) * value for name, value in parts.items())
+            total = jnp.sum(self.discount**last * per_iteration)
+            pose, parts = jax.tree.map(lambda leaf: leaf[-1], (poses, parts))
+            return total, parts | pose_metrics(pose, pair.target_from_source)
+
+        return mean_over_pairs(
+            of_pair, (variables, template), pairs, pairs_at_once=self.pairs_at_once
+        )
+
+
 @settings_class
-class PointNetLKLoss(Settings):
+class PointNetLKLoss(_IterationsLoss):
     """A `vanejax.training.train_step.Loss` for PointNetLK.
 
     Published: the matrix loss after the last iteration, with gradients through all of them, and in
@@ -46,37 +83,17 @@ class PointNetLKLoss(Settings):
     residual: float = factor(0.0)
     pairs_at_once: int = positive(1)
 
-    def __call__(
-        self, model: PointNetLK, variables: Variables, pairs: Pair
-    ) -> tuple[jax.Array, Metrics]:
-        """Mean loss [] over a batch that shares its target, and mean metrics [].
-
-        Metrics: each part of the loss and the pose error, all after the last iteration.
-        """
-        # Once for the batch: seven passes of the encoder, and the pseudo-inverse.
-        template = model.apply(variables, pairs.target, method="template")
-
-        def of_pair(
-            shared: Any, source: PointCloud, truth: RigidTransform
-        ) -> tuple[jax.Array, Metrics]:
-            variables, template = shared
-            init = RigidTransform.identity()
-            steps = model.apply(
-                variables, source, pairs.target, init, self.iterations, template=template
-            )
-            poses = steps.target_from_source
-            parts = {"matrix": jax.vmap(matrix_loss, (0, None))(poses, truth)}
-            if self.residual:
-                parts["residual"] = jnp.mean(steps.residual**2, axis=-1)
-            return _of_iterations(self, parts, poses, truth)
-
-        return mean_over_pairs(
-            of_pair, (variables, template), pairs, pairs_at_once=self.pairs_at_once
-        )
+    def of_iterations(self, steps: LucasKanadeSteps, pair: Pair) -> tuple[RigidTransform, Metrics]:
+        """Poses [I] and parts [I]."""
+        poses = steps.target_from_source
+        parts = {"matrix": jax.vmap(matrix_loss, (0, None))(poses, pair.target_from_source)}
+        if self.residual:
+            parts["residual"] = jnp.mean(steps.residual**2, axis=-1)
+        return poses, parts
 
 
 @settings_class
-class PcrNetLoss(Settings):
+class PcrNetLoss(_IterationsLoss):
     """A `vanejax.training.train_step.Loss` for PCRNet.
 
     Published: the earth mover's distance between the moved source and the template, or Chamfer's,
@@ -98,32 +115,14 @@ class PcrNetLoss(Settings):
     chamfer: float = factor(0.0)
     pairs_at_once: int = positive(1)
 
-    def __call__(
-        self, model: PcrNet, variables: Variables, pairs: Pair
-    ) -> tuple[jax.Array, Metrics]:
-        """Mean loss [] over a batch that shares its target, and mean metrics [].
-
-        Metrics: each part of the loss and the pose error, all after the last iteration.
-        """
-        template = model.apply(variables, pairs.target, method="template")
-
-        def of_pair(
-            shared: Any, source: PointCloud, truth: RigidTransform
-        ) -> tuple[jax.Array, Metrics]:
-            variables, template = shared
-            init = RigidTransform.identity()
-            poses = model.apply(
-                variables, source, pairs.target, init, self.iterations, template=template
-            )
-            parts = {"pose": jax.vmap(losses.pose_loss, (0, None, None))(poses, truth, source)}
-            if self.chamfer:
-                chamfer = jax.vmap(chamfer_loss, (0, None, None))
-                parts["chamfer"] = chamfer(poses, source, pairs.target)
-            return _of_iterations(self, parts, poses, truth)
-
-        return mean_over_pairs(
-            of_pair, (variables, template), pairs, pairs_at_once=self.pairs_at_once
-        )
+    def of_iterations(self, steps: RigidTransform, pair: Pair) -> tuple[RigidTransform, Metrics]:
+        """Poses [I] and parts [I]."""
+        pose = jax.vmap(losses.pose_loss, (0, None, None))
+        parts = {"pose": pose(steps, pair.target_from_source, pair.source)}
+        if self.chamfer:
+            chamfer = jax.vmap(chamfer_loss, (0, None, None))
+            parts["chamfer"] = chamfer(steps, pair.source, pair.target)
+        return steps, parts
 
 
 def matrix_loss(found: RigidTransform, truth: RigidTransform) -> jax.Array:
@@ -143,17 +142,3 @@ def chamfer_loss(found: RigidTransform, source: PointCloud, target: PointCloud) 
     offsets, _ = nearest_offsets(source.transform(found), target)
     squared = jnp.sum(offsets**2, axis=-1)
     return jnp.sum(squared, where=source.mask) / jnp.maximum(jnp.sum(source.mask), 1)
-
-
-def _of_iterations(
-    loss: PointNetLKLoss | PcrNetLoss,
-    parts: Metrics,
-    poses: RigidTransform,
-    truth: RigidTransform,
-) -> tuple[jax.Array, Metrics]:
-    """The discounted sum [] of parts [I] times their factors, and the last iteration's metrics."""
-    last = jnp.arange(loss.iterations - 1.0, -1.0, -1.0)
-    per_iteration = sum(getattr(loss, name) * value for name, value in parts.items())
-    total = jnp.sum(loss.discount**last * per_iteration)
-    pose = jax.tree.map(lambda leaf: leaf[-1], poses)
-    return total, {name: value[-1] for name, value in parts.items()} | pose_metrics(pose, truth)

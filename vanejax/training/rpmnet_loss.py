@@ -10,13 +10,14 @@ import jax.numpy as jnp
 from vanejax.matching import fast_rpmnet
 from vanejax.matching.metrics import pose_metrics
 from vanejax.matching.rpmnet import Match, RpmNet
-from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.settings import Settings, factor, not_negative, positive, settings_class
 from vanejax.training import loss_terms as losses
 from vanejax.training.gradient_sums import mean_over_pairs, sum_with_gradient
 from vanejax.training.pairs import Pair
 from vanejax.training.train_step import Metrics, Variables
+
+_Shared = tuple[Variables, jax.Array]  # weights, and the reference's features
 
 
 @settings_class
@@ -67,14 +68,11 @@ class RpmNetLoss(Settings):
         features = fast_rpmnet.features(model, variables, pairs.target)
         weights = self.discount ** jnp.arange(self.iterations - 1.0, -1.0, -1.0)
 
-        def of_pair(
-            shared: tuple[Variables, jax.Array], source: PointCloud, truth: RigidTransform
-        ) -> tuple[jax.Array, Metrics]:
-            pair = Pair(source=source, target=pairs.target, target_from_source=truth)
-            near = fast_rpmnet.neighborhoods(model, source)
+        def of_pair(shared: _Shared, pair: Pair) -> tuple[jax.Array, Metrics]:
+            source, near = pair.source, fast_rpmnet.neighborhoods(model, pair.source)
 
             def iteration(
-                shared: tuple[Variables, jax.Array], pose: RigidTransform, weight: jax.Array
+                shared: _Shared, pose: RigidTransform, weight: jax.Array
             ) -> tuple[jax.Array, RigidTransform, Metrics]:
                 variables, features = shared
                 match = fast_rpmnet.match(
@@ -82,7 +80,7 @@ class RpmNetLoss(Settings):
                 )
                 value, parts = self.of_match(match, source, pair)
                 pose = match.target_from_source
-                return weight * value, pose, parts | pose_metrics(pose, truth)
+                return weight * value, pose, parts | pose_metrics(pose, pair.target_from_source)
 
             # the published network does not differentiate through the pose either
             init = jax.tree.map(jnp.asarray, RigidTransform.identity())

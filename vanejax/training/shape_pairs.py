@@ -39,12 +39,41 @@ class ShapeBank:
         return self.points.shape[0]
 
     def draw(self, key: jax.Array, entries: jax.Array, sampling: PairSampling) -> Pair:
-        """`draw_shape_pairs` of the first of these shapes [B] i32, with B sources.
+        """A batch of the first of these shapes [B] i32; every point is real.
 
         A batch shares its target, so it is of one shape; where entries come in random order, so do
-        the shapes.
+        the shapes. Either cloud is ``num_reference`` points of the sampling, cropped; its
+        ``num_source`` has no say.
+
+        Returns:
+          Pair with source [B, N] and target_from_source [B], and one target [N] for all of them, in
+          unit-sphere units, in random order: row i of one is not row i of the other. N is
+          0.7 num_reference, rounded: 717 of 1024.
+
+        Raises:
+          InputError: the shapes have fewer points than ``num_reference``.
         """
-        return draw_shape_pairs(key, self, entries[0], entries.shape[0], sampling)
+        whole, held = sampling.num_reference, self.points.shape[1]
+        if held < whole:
+            raise InputError(f"the shapes have {held} points each, {whole} are wanted")
+        rows = round(KEPT_SHARE * whole)
+        shape = PointCloud.create(xyz=self.points[entries[0]], normals=self.normals[entries[0]])
+
+        def draw_cloud(key: jax.Array) -> PointCloud:
+            subset_key, crop_key, noise_key = jax.random.split(key, 3)
+            cloud = draw_subset(subset_key, shape, jnp.asarray(whole), whole)
+            return jitter(noise_key, crop(crop_key, cloud, rows), sampling)
+
+        def draw_source(key: jax.Array) -> tuple[PointCloud, RigidTransform]:
+            cloud_key, pose_key = jax.random.split(key)
+            source_from_target = draw_pose(pose_key, sampling)
+            moved = draw_cloud(cloud_key).transform(source_from_target)
+            return moved, source_from_target.inverse()
+
+        target_key, source_key = jax.random.split(key)
+        keys = jax.random.split(source_key, entries.shape[0])
+        source, target_from_source = jax.vmap(draw_source)(keys)
+        return Pair(source, draw_cloud(target_key), target_from_source)
 
 
 def crop(key: jax.Array, cloud: PointCloud, rows: int) -> PointCloud:
@@ -58,62 +87,3 @@ def crop(key: jax.Array, cloud: PointCloud, rows: int) -> PointCloud:
     _, index = jax.lax.top_k(jnp.where(cloud.mask, height, -jnp.inf), rows)
     # by height they would tell a network of the plane: a neighbourhood is cut by index
     return jax.tree.map(lambda leaf: leaf[jnp.sort(index)], cloud)
-
-
-def draw_shape_pairs(
-    key: jax.Array,
-    bank: ShapeBank,
-    index: jax.Array,
-    batch_size: int,
-    sampling: PairSampling,
-    *,
-    keep: float = KEPT_SHARE,
-    crop_target: bool = True,
-) -> Pair:
-    """A batch of one shape, whose sources share one target; every point is real.
-
-    Args:
-      index: [] i32, which shape.
-      batch_size: B.
-      sampling: ``num_reference`` points are drawn for either cloud, then cropped; ``num_source``
-        has no say.
-      keep: share of the points that cropping leaves, above 0 and at most 1.
-      crop_target: whether the target loses a part too, as published. The crop of the target and of
-        every source is its own.
-
-    Returns:
-      Pair with source [B, N] and target_from_source [B], and one target [M] for all of them, in
-      unit-sphere units: N = round(keep num_reference) (717 of 1024), M the same or num_reference.
-      Both in random order: row i of one is not row i of the other.
-
-    Raises:
-      InputError: the shapes have fewer points than ``num_reference``, or ``keep`` leaves none.
-    """
-    whole, held = sampling.num_reference, bank.points.shape[1]
-    if held < whole:
-        raise InputError(f"the shapes have {held} points each, {whole} are wanted")
-    rows = round(keep * whole)
-    if not 0 < rows <= whole:
-        raise InputError(f"keep={keep} leaves {rows} of {whole} points; take 0 < keep <= 1")
-    shape = PointCloud.create(xyz=bank.points[index], normals=bank.normals[index])
-
-    def draw_cloud(key: jax.Array, rows: int) -> PointCloud:
-        subset_key, crop_key, noise_key = jax.random.split(key, 3)
-        cloud = draw_subset(subset_key, shape, jnp.asarray(whole), whole)
-        if rows < whole:
-            cloud = crop(crop_key, cloud, rows)
-        return jitter(noise_key, cloud, sampling)
-
-    def draw_source(key: jax.Array) -> tuple[PointCloud, RigidTransform]:
-        cloud_key, pose_key = jax.random.split(key)
-        source_from_target = draw_pose(pose_key, sampling)
-        moved = draw_cloud(cloud_key, rows).transform(source_from_target)
-        return moved, source_from_target.inverse()
-
-    target_key, source_key = jax.random.split(key)
-    source, target_from_source = jax.vmap(draw_source)(jax.random.split(source_key, batch_size))
-    return Pair(
-        source=source,
-        target=draw_cloud(target_key, rows if crop_target else whole),
-        target_from_source=target_from_source,
-    )

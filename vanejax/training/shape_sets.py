@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 
 from vanejax.errors import InputError
-from vanejax.files import array_header
+from vanejax.files import read_arrays
 from vanejax.training.generic_solids import make_solids
-from vanejax.training.modelnet40 import PUBLISHED, read_modelnet40, thinned
+from vanejax.training.modelnet40 import read_modelnet40, thinned
 
 NUM_SOLIDS = 200
-MAX_BYTES = 2**32  # of an array: a compressed file may promise any size
 RADIUS = 1.001  # of the unit sphere once its points are rounded to float16
 
 
@@ -52,9 +49,8 @@ def load_shapes(
 
     Args:
       where: ``solids`` or ``solids:COUNT`` (procedural, see `vanejax.training.generic_solids`); a
-        folder of
-        ModelNet40, see `vanejax.training.modelnet40`; or a .npz file with ``points_normals``
-        [S, P, 6], float16 or float32, in the unit sphere, and ``names`` [S].
+        folder of ModelNet40, see `vanejax.training.modelnet40`; or a .npz file with
+        ``points_normals`` [S, P, 6], float16 or float32, in the unit sphere, and ``names`` [S].
       seed: of the solids, of the samples on meshes, and of which points are kept.
       num_points: of each shape, at least 1; fewer where the file holds fewer.
       split, categories: of a ModelNet40 folder; see `read_modelnet40`.
@@ -80,13 +76,7 @@ def load_shapes(
     found = read_modelnet40(
         path, split=split, categories=categories, seed=seed, num_points=num_points
     )
-    published = PUBLISHED[found.layout, split]
-    whole = "as published" if found.split_size == published else f"where {published} are published"
-    title = (
-        f"ModelNet40 ({found.layout}), {split} split, {categories} categories: {len(found.names)} "
-        f"shapes of {found.split_size}, {whole}"
-    )
-    return _shape_set(found.samples, found.names, title, path)
+    return _shape_set(*found, path)
 
 
 def _count(text: str, where: str) -> int:
@@ -130,17 +120,9 @@ def _read_npz(path: Path) -> tuple[np.ndarray, list[str]]:
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")
     try:
-        with zipfile.ZipFile(path) as archive:
-            samples, names = (_array(archive, name) for name in ("points_normals", "names"))
-    except (
-        ValueError,
-        OSError,
-        zipfile.BadZipFile,
-        zlib.error,
-        EOFError,
-        NotImplementedError,
-        RuntimeError,
-    ) as error:
+        arrays, _ = read_arrays(path)
+        samples, names = arrays["points_normals"], arrays["names"]
+    except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read: {error}") from error
     except KeyError as error:
         raise InputError(f"{path}: should hold 'points_normals' and 'names'") from error
@@ -151,20 +133,3 @@ def _read_npz(path: Path) -> tuple[np.ndarray, list[str]]:
     if names.shape != samples.shape[:1] or names.dtype.kind != "U":
         raise InputError(f"{path}: names should be {len(samples)} strings")
     return samples, names.tolist()
-
-
-def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """One array, compressed or not; no larger than what the archive announces and `MAX_BYTES`."""
-    entry = archive.getinfo(f"{name}.npy")
-    if entry.file_size > MAX_BYTES:
-        raise ValueError(f"{name} announces {entry.file_size:,} bytes")
-    with archive.open(entry) as file:
-        shape, fortran, dtype = array_header(file)
-        data = file.read()
-    if (
-        dtype.hasobject
-        or fortran
-        or len(data) != int(np.prod(shape, dtype=object)) * dtype.itemsize
-    ):
-        raise ValueError(f"{name} does not hold the array that it announces")
-    return np.frombuffer(data, dtype).reshape(shape)
