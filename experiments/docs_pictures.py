@@ -37,8 +37,7 @@ from vanejax.scans.measured_scan import MeasuredScan, clean_scan
 from vanejax.scans.segmentation import segment
 from vanejax.training.dataset import make_scan_set
 from vanejax.training.pairs import draw_pairs, make_bank
-from vanejax.training.pretrained import find_weights
-from vanejax.training.weight_file import TrainedMatcher
+from vanejax.training.weight_file import TrainedMatcher, find_weights
 
 VIEW = 20  # of the 216: elevation 60, azimuth 200 deg, a test view
 SHOWN = (0, 20, 85)  # views whose shadow is drawn

@@ -29,7 +29,7 @@ from experiments.runner import study_command as study
 from vanejax.cad import guide_vane
 from vanejax.errors import InputError
 from vanejax.files import check_writable, write_text
-from vanejax.training.pretrained import PRETRAINED, find_weights
+from vanejax.training.weight_file import PRETRAINED, find_weights
 
 DOCS = ROOT / "docs"
 PAGE = DOCS / "results.md"

@@ -19,8 +19,7 @@ from vanejax.localization.registration import register
 from vanejax.rigid import RigidTransform
 from vanejax.scanner import Camera, Scanner, hemisphere_viewpoints
 from vanejax.scans.measured_scan import MeasuredScan
-from vanejax.training.pretrained import find_weights, pretrained_matcher
-from vanejax.training.weight_file import TrainedMatcher
+from vanejax.training.weight_file import TrainedMatcher, find_weights
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +29,7 @@ def part() -> Part:
 
 @pytest.fixture(scope="module")
 def matcher(part: Part) -> TrainedMatcher:
-    found = pretrained_matcher(part)
-    assert found is not None
-    return found
+    return find_weights("pretrained", part)
 
 
 def part_of(mesh: trimesh.Trimesh, name: str) -> Part:

@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     matcher = None
     if arguments.weights is not None:
         from vanejax import compilation_cache
-        from vanejax.training.pretrained import find_weights
+        from vanejax.training.weight_file import find_weights
 
         compilation_cache.enable()
         matcher = find_weights(arguments.weights, part)

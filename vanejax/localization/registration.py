@@ -275,7 +275,7 @@ def _load_weights(
 ) -> TrainedMatcher | None:
     """The matcher, read where a file is named, if it was trained for the part."""
     if isinstance(weights, str | os.PathLike):
-        from vanejax.training.pretrained import find_weights
+        from vanejax.training.weight_file import find_weights
 
         return find_weights(weights, part)
     if weights is not None:

@@ -7,7 +7,6 @@ In: a `ScanSet` (virtual scans with labels) and a network. Out: a pure training 
 from vanejax.training.checkpoint import Checkpoints, restore_or
 from vanejax.training.dataset import ScanSet, load_scan_set, make_scan_set
 from vanejax.training.pairs import Pair, PairSampling, draw_pairs, make_bank
-from vanejax.training.pretrained import find_weights
 from vanejax.training.rpmnet_loss import RpmNetLoss
 from vanejax.training.train_step import (
     OptimizerSettings,
@@ -16,7 +15,7 @@ from vanejax.training.train_step import (
     make_optimizer,
     make_train_step,
 )
-from vanejax.training.weight_file import TrainedMatcher, load_model, save_model
+from vanejax.training.weight_file import TrainedMatcher, find_weights, load_model, save_model
 
 __all__ = [
     "Checkpoints",

@@ -10,9 +10,11 @@ import dataclasses
 import json
 import os
 from collections.abc import Mapping
+from importlib import resources
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -28,6 +30,8 @@ from vanejax.training.pairs import PairSampling
 FORMAT = "vanejax matcher"
 VERSION = 1
 SAME_SURFACE = 1e-3  # of the radius: how far two files of one part may be apart
+PRETRAINED = "pretrained"  # in place of a file's name
+_WORDS = (PRETRAINED, "shipped")  # the second is the word of older versions
 
 # what a header may hold: a number's kind, least and largest value, wide, but no network is beyond
 _MODEL = {
@@ -100,8 +104,8 @@ class TrainedMatcher:
     def knows(self, part: Part) -> bool:
         """Whether the network was trained for this part, or for the same surface in another file.
 
-        A CAD model written again, or built with other rounding, has another hash; its surface is
-        the same where every reference point lies on it and all of it is near one of them.
+        Another file of the part has another hash. The surface is the same where every reference
+        point lies on it and all of it is near one of them.
         """
         if part.sha256 == self.part_sha256:
             return True
@@ -171,18 +175,38 @@ def load_model(path: str | os.PathLike[str]) -> TrainedMatcher:
     return _matcher(header, arrays, str(path))
 
 
+def find_weights(name: str | os.PathLike[str], part: Part) -> TrainedMatcher:
+    """The matcher of a file, or the pretrained one where ``name`` is "pretrained" ("shipped").
+
+    Pretrained weights come with the package: an RPM-Net for the built-in guide vane.
+
+    Raises:
+      InputError: the file cannot be read, or there is no network for this part.
+    """
+    if os.fspath(name) not in _WORDS:
+        matcher = load_model(name)
+        matcher.check_part(part)
+        return matcher
+    folder = resources.files("vanejax.training") / "pretrained_weights"
+    with resources.as_file(folder / "guide_vane.safetensors") as path:
+        pretrained = load_model(path)
+    if not pretrained.knows(part):
+        raise InputError(
+            f"there are no pretrained weights for {part.name}, only for the built-in guide vane "
+            "(vane); train for it and export, or leave the weights out: registration works without"
+        )
+    return pretrained
+
+
 def abstract_variables(model: RpmNet) -> Any:
     """The shapes and dtypes of a network's weights; nothing is computed."""
-    # how many points there are does not change the weights
-    cloud = PointCloud(
-        xyz=jax.ShapeDtypeStruct((4, 3), np.float32),
-        normals=jax.ShapeDtypeStruct((4, 3), np.float32),
-        mask=jax.ShapeDtypeStruct((4,), bool),
-    )
-    return jax.eval_shape(
-        lambda cloud: model.init(jax.random.key(0), cloud, cloud, RigidTransform.identity(), 1),
-        cloud,
-    )
+
+    def init() -> Any:
+        # how many points there are does not change the weights
+        cloud = PointCloud.create(jnp.zeros((4, 3)), jnp.zeros((4, 3)))
+        return model.init(jax.random.key(0), cloud, cloud, RigidTransform.identity(), 1)
+
+    return jax.eval_shape(init)
 
 
 def model_from_dict(values: Any, where: str) -> RpmNet:

@@ -25,8 +25,7 @@ from experiments.studies.verdicts.report import verdict_counts
 from vanejax.localization.registration import register
 from vanejax.rigid import RigidTransform
 from vanejax.scans.measured_scan import MeasuredScan
-from vanejax.training.pretrained import find_weights
-from vanejax.training.weight_file import TrainedMatcher
+from vanejax.training.weight_file import TrainedMatcher, find_weights
 
 RIGHT_DEG, RIGHT_MM = 0.1, 0.1
 LEAST_RIGHT, MOST_SECONDS = 0.98, 10.0

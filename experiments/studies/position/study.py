@@ -54,8 +54,7 @@ from vanejax.machine.positioning import (
 from vanejax.plotting.canvas import save_figure
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.sensor import Sensor, preset
-from vanejax.training.pretrained import find_weights
-from vanejax.training.weight_file import TrainedMatcher
+from vanejax.training.weight_file import TrainedMatcher, find_weights
 
 SENSOR = "paper_camera"
 VIEWS = "108,115,122,129,136"  # all 75 deg high

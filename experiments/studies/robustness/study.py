@@ -44,8 +44,7 @@ from vanejax.scanner.sensor import preset
 from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.measured_scan import MeasuredScan
 from vanejax.training.online_scans import RandomViews
-from vanejax.training.pretrained import find_weights
-from vanejax.training.weight_file import TrainedMatcher
+from vanejax.training.weight_file import TrainedMatcher, find_weights
 
 SENSOR = "paper_camera"
 START_DEG, START_SHARE = 45.0, 0.5  # of the part's radius

@@ -24,7 +24,7 @@ from vanejax.scanner.measurement import measure
 from vanejax.scanner.sensor import preset
 from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.scan_file import save_points
-from vanejax.training.pretrained import pretrained_matcher
+from vanejax.training.weight_file import find_weights
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_good_network_and_a_bad_one_are_told_apart(
     folder: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
-    good = pretrained_matcher(guide_vane())
+    good = find_weights("pretrained", guide_vane())
     assert good is not None
     # weights that know nothing: every feature alike
     bad = dataclasses.replace(good, variables=_zeroed(good.variables))
