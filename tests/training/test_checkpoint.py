@@ -8,19 +8,14 @@ import pytest
 
 from vanejax.errors import InputError
 from vanejax.training.checkpoint import Checkpoints, all_finite, restore_or
-from vanejax.training.train_step import TrainState
-
-OPTIMIZER = optax.adam(1e-3)
+from vanejax.training.train_step import TrainState, first_state
 
 
 def make_state(step: int, width: int = 3) -> TrainState:
     variables = {"params": {"kernel": jnp.full((width, 2), step / 7), "bias": jnp.zeros(2)}}
-    return TrainState(
-        step=jnp.asarray(step, jnp.int32),
-        variables=variables,
-        average=jax.tree.map(lambda leaf: leaf * 0.5, variables),
-        opt_state=OPTIMIZER.init(variables),
-    )
+    average = jax.tree.map(lambda leaf: leaf * 0.5, variables)
+    state = first_state(optax.adam(1e-3), variables)
+    return state.replace(step=jnp.asarray(step, jnp.int32), average=average)
 
 
 def test_a_state_comes_back_bit_equal(tmp_path) -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scipy.spatial
 
-from vanejax.errors import InputError
 from vanejax.training.generic_solids import make_solid, make_solids
 
 COUNT = 24
@@ -71,10 +70,3 @@ def test_a_seed_names_its_solids(solids):
     assert names == solids[1][:3]
     assert make_solid(2, 0).sha256 == make_solid(2, 0).sha256
     assert make_solid(2, 1).sha256 != make_solid(2, 0).sha256
-
-
-def test_what_cannot_be_made():
-    with pytest.raises(InputError, match="at least 1"):
-        make_solids(0, seed=0)
-    with pytest.raises(InputError, match="negative"):
-        make_solids(1, seed=-1)

@@ -21,8 +21,9 @@ from experiments.runner.run_folder import RunFolder
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.files import read_arrays, write_arrays
-from vanejax.training import Checkpoints, ScanSet, TrainState, make_optimizer, make_scan_set
+from vanejax.training import Checkpoints, ScanSet, make_optimizer, make_scan_set
 from vanejax.training.export import export_workdir
+from vanejax.training.train_step import first_state
 from vanejax.training.weight_file import (
     TrainedMatcher,
     abstract_variables,
@@ -67,12 +68,7 @@ def workdir(config: Experiment, part: Part, scans: ScanSet, tmp_path_factory) ->
             lambda leaf: jnp.asarray(0.1 * rng.normal(size=leaf.shape), leaf.dtype),
             abstract_variables(config.make_network().model),
         )
-        state = TrainState(
-            step=jnp.asarray(0, jnp.int32),
-            variables=variables,
-            average=variables,
-            opt_state=make_optimizer(config.training).init(variables),
-        )
+        state = first_state(make_optimizer(config.training), variables)
         with Checkpoints(folder.checkpoints) as checkpoints:
             for step, score in ((10, 1.0), (20, 2.0)):
                 average = jax.tree.map(lambda leaf, step=step: leaf + 0.01 * step, state.variables)

@@ -15,9 +15,9 @@ from vanejax.files import read_json
 from vanejax.matching.rpmnet import RpmNet
 from vanejax.scanner.camera import Camera
 from vanejax.training.checkpoint import Checkpoints
-from vanejax.training.dataset import ScanSet, load_scan_set
+from vanejax.training.dataset import load_scan_set
 from vanejax.training.pairs import PairSampling
-from vanejax.training.train_step import OptimizerSettings, TrainState, make_optimizer
+from vanejax.training.train_step import OptimizerSettings, first_state, make_optimizer
 from vanejax.training.weight_file import (
     TrainedMatcher,
     abstract_variables,
@@ -31,16 +31,13 @@ Which = Literal["best", "last"]
 def export_workdir(
     workdir: str | os.PathLike[str], path: str | os.PathLike[str], *, checkpoint: Which = "best"
 ) -> TrainedMatcher:
-    """Writes the weights of a training run with all that inference needs.
+    """Writes the weights of a training run with all that inference needs, and returns them.
 
     Args:
       workdir: as ``experiments.train`` left it: run.json, scans.npz and checkpoints/. It is only
         read, so a run that still goes on may be exported.
       path: the file to write: safetensors, or .npz by that suffix.
       checkpoint: the one with the smallest error on the validation pairs, or the newest.
-
-    Returns:
-      What was written.
 
     Raises:
       InputError: the folder holds no such run, its pieces do not fit together, or the file cannot
@@ -55,8 +52,8 @@ def export_workdir(
     if not record.exists():
         raise InputError(f"{record}: no such file; {workdir} is no training run")
     run = _read_object(record)
-    part = run.get("part")
-    if not isinstance(part, dict) or not isinstance(run.get("config"), dict):
+    part, config = run.get("part"), run.get("config")
+    if not isinstance(part, dict) or not isinstance(config, dict):
         raise InputError(f"{record}: does not say which config and part the run is of")
     scans = load_scan_set(workdir / "scans.npz")
     hashes = str(part.get("sha256")), str(scans.source.get("part_sha256"))
@@ -66,7 +63,6 @@ def export_workdir(
             f"{hashes[1][:12]}: the folder mixes two runs"
         )
     try:
-        config = run["config"]
         settings = dict(config["model"])
         iterations = settings.pop("test_iterations")
         name = settings.pop("name", "rpmnet")  # runs of older versions are all RPM-Net's
@@ -75,8 +71,10 @@ def export_workdir(
                 f"{workdir} is a run of {name!r}: register takes the weights of an RPM-Net"
             )
         model = model_from_dict(settings, str(record))
-        sampling = _sampling(config["data"], scans)
-        voxel_mm = config["data"]["voxel_mm"]
+        data = {"num_source": 0} | config["data"]  # older versions have no such setting
+        names = [field.name for field in dataclasses.fields(PairSampling)]
+        sampling = PairSampling(**{name: data[name] for name in names}).fitted(scans)
+        voxel_mm = data["voxel_mm"]
         camera = Camera.from_dict(scans.source["camera"])
     except (KeyError, TypeError) as error:
         raise InputError(
@@ -85,8 +83,8 @@ def export_workdir(
     variables, step = _read_weights(workdir, model, checkpoint)
     evaluation = None  # the run's own figures on its test views
     if (figures := workdir / "evaluation.json").exists():
-        names, values = ("views", "summary", "date"), _read_object(figures)
-        evaluation = {name: values[name] for name in names if name in values}
+        values = _read_object(figures)
+        evaluation = {key: values[key] for key in ("views", "summary", "date") if key in values}
     matcher = TrainedMatcher(
         model=model,
         variables=variables,
@@ -101,7 +99,7 @@ def export_workdir(
         part_sha256=hashes[0],
         camera=camera,
         trained={"step": step, "checkpoint": checkpoint}
-        | {name: run.get(name) for name in ("versions", "commit", "started")}
+        | {key: run.get(key) for key in ("versions", "commit", "started")}
         | {"experiment": config.get("name"), "seed": config.get("seed"), "config": config}
         | {"evaluation": evaluation},
     )
@@ -109,30 +107,17 @@ def export_workdir(
     return matcher
 
 
-def _sampling(data: dict[str, Any], scans: ScanSet) -> PairSampling:
-    names = {field.name for field in dataclasses.fields(PairSampling)} - {"num_source"}
-    sampling = PairSampling(**{name: data[name] for name in names})
-    return dataclasses.replace(sampling, num_source=data.get("num_source", 0)).fitted(scans)
-
-
 def _read_weights(workdir: Path, model: RpmNet, checkpoint: Which) -> tuple[Any, int]:
     """The averaged weights as numpy arrays, and the step that they are of."""
     folder = workdir / "checkpoints"
     if not folder.is_dir():
         raise InputError(f"{workdir}: holds no checkpoints; train first")
-    variables = abstract_variables(model)
     # only its structure counts, which no number changes
     optimizer = make_optimizer(OptimizerSettings())
-    like = TrainState(
-        step=jax.ShapeDtypeStruct((), np.int32),
-        variables=variables,
-        average=variables,
-        opt_state=jax.eval_shape(optimizer.init, variables),
-    )
+    like = jax.eval_shape(lambda some: first_state(optimizer, some), abstract_variables(model))
     with Checkpoints(folder) as checkpoints:
-        steps = {"best": checkpoints.best_step, "last": checkpoints.latest_step}
-        step = steps[checkpoint]
-        if step is None and checkpoint == "best" and steps["last"] is not None:
+        step = checkpoints.best_step if checkpoint == "best" else checkpoints.latest_step
+        if step is None and checkpoints.latest_step is not None:
             raise InputError(f"{folder}: none was validated yet; take the last checkpoint")
         state = checkpoints.restore(like, step=step)
     return jax.tree.map(np.asarray, state.average), int(state.step)

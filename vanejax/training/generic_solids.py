@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
 
-NUM_POINTS = 4096
 SEGMENTS = 64
 MOST_STEPS = 4  # primitives beside the first
 SQUARE_SHARE = 0.6  # of the primitives that stand along the axes, as in most machined parts
@@ -31,44 +30,28 @@ TRIES = 20
 Rng = np.random.Generator
 
 
-def make_solids(
-    count: int, seed: int, *, num_points: int = NUM_POINTS
-) -> tuple[np.ndarray, list[str]]:
-    """Surface samples of the solids number 0 to ``count`` - 1 of a seed.
+def make_solids(count: int, seed: int, num_points: int) -> tuple[np.ndarray, list[str]]:
+    """Samples [S, P, 6] of the solids number 0 to ``count`` - 1 of a seed, see `unit_samples`.
 
-    Args:
-      count: S, at least 1.
-      seed: more solids of the same seed begin with the same ones.
-      num_points: P, of each.
-
-    Returns:
-      [S, P, 6] f32: points uniform over the area, moved and scaled into the unit sphere as scans
-      are (`Part.center` to 0, `Part.radius` to 1), and outward unit normals; names [S] such as
-      ``0007 box + cone - torus``.
-
-    Raises:
-      InputError: ``count`` is below 1, or ``seed`` negative.
+    Their names [S] are such as ``0007 box + cone - torus``.
     """
-    if count < 1:
-        raise InputError(f"cannot make {count} solids; ask for at least 1")
-    samples, names = np.empty((count, num_points, 6), np.float32), []
-    for number in range(count):
-        part = make_solid(number, seed)
-        points, normals, _ = part.sample(num_points, seed=number)
-        samples[number, :, :3] = (points - part.center) / part.radius
-        samples[number, :, 3:] = normals
-        names.append(part.name)
-    return samples, names
+    parts = [make_solid(number, seed) for number in range(count)]
+    samples = [unit_samples(part, num_points, number) for number, part in enumerate(parts)]
+    return np.stack(samples), [part.name for part in parts]
+
+
+def unit_samples(part: Part, num_points: int, seed: int) -> np.ndarray:
+    """[P, 6] f32: points uniform over a part's area, and their unit normals.
+
+    They are moved and scaled into the unit sphere as scans are: `Part.center` to 0, `Part.radius`
+    to 1.
+    """
+    points, normals, _ = part.sample(num_points, seed=seed)
+    return np.hstack([(points - part.center) / part.radius, normals]).astype(np.float32)
 
 
 def make_solid(number: int, seed: int) -> Part:
-    """One closed solid of one body; the same number and seed give the same bits.
-
-    Raises:
-      InputError: ``number`` or ``seed`` is negative.
-    """
-    if number < 0 or seed < 0:
-        raise InputError(f"solid {number} of seed {seed}: neither may be negative")
+    """One closed solid of one body; the same number and seed give the same bits."""
     rng = np.random.default_rng([seed, number])
     for _ in range(TRIES):
         solid, recipe = _composed(rng)

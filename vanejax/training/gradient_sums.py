@@ -37,14 +37,7 @@ def sum_with_gradient(body: Body, shared: Any, carry: Any, xs: Any) -> tuple[jax
     Returns:
       The sum of the values [], the last carry, and the stacked aux.
     """
-
-    def turn(total: tuple, x: Any) -> tuple:
-        value, carry = total
-        new, carry, aux = body(shared, carry, x)
-        return (value + new, carry), aux
-
-    (value, carry), aux = jax.lax.scan(turn, (jnp.zeros(()), carry), xs)
-    return value, carry, aux
+    return _forward(body, shared, carry, xs)[0]
 
 
 def _forward(body: Body, shared: Any, carry: Any, xs: Any) -> tuple:
@@ -55,11 +48,11 @@ def _forward(body: Body, shared: Any, carry: Any, xs: Any) -> tuple:
         value, carry, aux = body(unflatten(flat), carry, x)
         return value, (carry, aux)
 
+    with_slope = jax.value_and_grad(value_and_rest, has_aux=True)
+
     def turn(total: tuple, x: Any) -> tuple:
         value, gradient, carry = total
-        (new, (carry, aux)), slope = jax.value_and_grad(value_and_rest, has_aux=True)(
-            flat, carry, x
-        )
+        (new, (carry, aux)), slope = with_slope(flat, carry, x)
         return (value + new, gradient + slope, carry), aux
 
     start = (jnp.zeros(()), jnp.zeros_like(flat), carry)
@@ -67,11 +60,10 @@ def _forward(body: Body, shared: Any, carry: Any, xs: Any) -> tuple:
     return (value, carry, aux), (gradient, shared)
 
 
-def _backward(body: Body, saved: tuple, cotangents: tuple) -> tuple:
-    del body
+def _backward(_: Body, saved: tuple, cotangents: tuple) -> tuple:
     gradient, shared = saved
     _, unflatten = ravel_pytree(shared)
-    scale, _, _ = cotangents  # carry and aux are constants
+    scale, *_ = cotangents  # carry and aux are constants
     return unflatten(scale * gradient), None, None
 
 

@@ -16,6 +16,7 @@ import trimesh
 from vanejax.cad.part import Part
 from vanejax.cad.triangles import in_use, renumbered
 from vanejax.errors import InputError
+from vanejax.training.generic_solids import unit_samples
 
 HDF5_FOLDER, OFF_FOLDER = "modelnet40_ply_hdf5_2048", "ModelNet40"
 PUBLISHED = {("HDF5", "train"): 9840, ("HDF5", "test"): 2468} | {
@@ -182,11 +183,9 @@ def _read_off_tree(folder: Path, split: str, categories: str, seed: int, num_poi
     kept = [path for path in files if _is_chosen(path.parents[1].name, categories)]
     samples = np.empty((len(kept), num_points, 6), np.float32)
     for row, path in zip(samples, kept, strict=True):
-        part = read_off(path)
         # its own seed: a shape is sampled alike whatever others are there
         own = hashlib.sha256(f"{seed} {path.stem}".encode()).digest()[:8]
-        points, normals, _ = part.sample(num_points, seed=int.from_bytes(own))
-        row[:, :3], row[:, 3:] = (points - part.center) / part.radius, normals
+        row[:] = unit_samples(read_off(path), num_points, int.from_bytes(own))
     return samples, [path.stem for path in kept], len(files)
 
 

@@ -65,7 +65,7 @@ def load_shapes(
     kind, _, count = where.partition(":")
     if kind == "solids":
         wanted = _count(count, where) if count else NUM_SOLIDS
-        samples, names = make_solids(wanted, seed, num_points=num_points)
+        samples, names = make_solids(wanted, seed, num_points)
         title = f"{wanted} procedural solids of seed {seed} (random, not ModelNet40)"
         return _shape_set(samples, names, title)
     path = Path(where)

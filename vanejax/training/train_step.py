@@ -106,7 +106,11 @@ def init_state(
         source = jax.tree.map(lambda leaf: leaf[0], pairs.source)
         return model.init(key, source, pairs.target, RigidTransform.identity(), 1)
 
-    variables = init(jax.random.key(seed))
+    return first_state(optimizer, init(jax.random.key(seed)))
+
+
+def first_state(optimizer: optax.GradientTransformation, variables: Variables) -> TrainState:
+    """The state of a training that begins with these weights."""
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         variables=variables,
@@ -157,11 +161,8 @@ def make_train_step(
             lambda old, new: decay * old + (1 - decay) * new, state.average, variables
         )
         norm = jnp.linalg.norm(ravel_pytree(gradients)[0])
-        metrics = metrics | {"loss": value, "gradient_norm": norm}
-        new = TrainState(
-            step=state.step + 1, variables=variables, average=average, opt_state=opt_state
-        )
-        return new, metrics
+        metrics |= {"loss": value, "gradient_norm": norm}
+        return TrainState(state.step + 1, variables, average, opt_state), metrics
 
     # XLA's older generator of CPU kernels, of which the step has hundreds
     options = {"xla_cpu_use_fusion_emitters": False}
