@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -95,3 +95,9 @@ def count(text: str) -> int:
 def spread(seconds: list[float]) -> dict[str, float]:
     """Median, smallest and largest of some times."""
     return {"median": statistics.median(seconds), "min": min(seconds), "max": max(seconds)}
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a text table: cells to the right of columns that are as wide as their widest."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.rjust, row, widths)) for row in rows]

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from experiments.runner.study_command import aligned
+
 CELL_TESTS = {"own": "each under its own settings", "same": "the same test for all"}
 STATISTICS = ("mean", "median", "p95", "max")
 
@@ -108,12 +110,7 @@ def table(report: Mapping[str, Any]) -> str:
         if test == "same" and not two_tests(points):
             continue
         rows = [head, *(_row(point, fields, test) for point in points)]
-        widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
-        lines += [f"{report['part']['name']}: test views, {words}, mean"]
-        lines += [
-            "  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True))
-            for row in rows
-        ]
+        lines += [f"{report['part']['name']}: test views, {words}, mean", *aligned(rows)]
         lost = sum((point["tests"][test] or {}).get("non_finite_views", 0) for point in points)
         if lost:
             lines.append(f"WARNING: {lost} registrations are not finite and are left out.")

@@ -10,11 +10,12 @@ import jax
 
 from experiments.runner.trained import Trained
 from experiments.studies.comparison import open3d_methods
-from experiments.studies.comparison.settings import NETWORKS, Comparison, IcpSettings
+from experiments.studies.comparison.settings import NETWORKS, OPEN3D, Comparison
 from vanejax.matching.baselines.fgr import fgr
 from vanejax.matching.baselines.icp import icp
 from vanejax.matching.baselines.sac_ia import sac_ia
 from vanejax.matching.contract import Register, chain
+from vanejax.settings import Settings, values_of
 
 TITLES = {
     "icp": "ICP",
@@ -30,16 +31,18 @@ TITLES = {
     "open3d_fgr": "Open3D FGR",
 }
 
-
-# of the configuration, by method that is not a network
-GROUPS = {
-    "icp": ("icp",),
-    "sac_ia": ("sac_ia",),
-    "sac_ia_icp": ("sac_ia", "fine_icp"),
-    "fgr": ("fgr",),
-    "open3d_icp": ("open3d_icp",),
-    "open3d_ransac_icp": ("open3d_ransac", "open3d_fine_icp"),
-    "open3d_fgr": ("open3d_fgr",),
+# the groups of the configuration and what they configure, by method that is not a network
+GROUPS: dict[str, dict[str, Callable[..., Register]]] = {
+    "icp": {"icp": icp},
+    "sac_ia": {"sac_ia": sac_ia},
+    "sac_ia_icp": {"sac_ia": sac_ia, "fine_icp": icp},
+    "fgr": {"fgr": fgr},
+    "open3d_icp": {"open3d_icp": open3d_methods.icp},
+    "open3d_ransac_icp": {
+        "open3d_ransac": open3d_methods.ransac,
+        "open3d_fine_icp": open3d_methods.icp,
+    },
+    "open3d_fgr": {"open3d_fgr": open3d_methods.fgr},
 }
 
 
@@ -77,21 +80,9 @@ def make_method(name: str, config: Comparison, network: Trained | None = None) -
     if name in NETWORKS:
         assert network is not None
         return network.config.make_network().register(network.variables)
-    makers: dict[str, Callable[[], Register]] = {
-        "icp": lambda: jax.jit(icp(**_icp_fields(config.icp))),
-        "sac_ia": lambda: jax.jit(sac_ia(**_fields(config.sac_ia))),
-        "sac_ia_icp": lambda: jax.jit(
-            chain(sac_ia(**_fields(config.sac_ia)), icp(**_icp_fields(config.fine_icp)))
-        ),
-        "fgr": lambda: jax.jit(fgr(**_fields(config.fgr))),
-        "open3d_icp": lambda: open3d_methods.icp(**_icp_fields(config.open3d_icp)),
-        "open3d_ransac_icp": lambda: chain(
-            open3d_methods.ransac(**_fields(config.open3d_ransac)),
-            open3d_methods.icp(**_icp_fields(config.open3d_fine_icp)),
-        ),
-        "open3d_fgr": lambda: open3d_methods.fgr(**_fields(config.open3d_fgr)),
-    }
-    return makers[name]()
+    stages = [make(**_arguments(getattr(config, group))) for group, make in GROUPS[name].items()]
+    method = stages[0] if len(stages) == 1 else chain(*stages)
+    return method if name in OPEN3D else jax.jit(method)
 
 
 def settings_of(name: str, config: Comparison) -> dict[str, Any]:
@@ -100,14 +91,10 @@ def settings_of(name: str, config: Comparison) -> dict[str, Any]:
         experiment = dataclasses.asdict(config.experiment_of(name))
         own = ("model", "loss") if name == "rpmnet" else (name,)
         return {group: experiment[group] for group in (*own, "training")}
-    return {group: _fields(getattr(config, group)) for group in GROUPS[name]}
+    return {group: dataclasses.asdict(getattr(config, group)) for group in GROUPS[name]}
 
 
-def _fields(settings: Any) -> dict[str, Any]:
-    return dataclasses.asdict(settings)
-
-
-def _icp_fields(settings: IcpSettings) -> dict[str, Any]:
-    """Without a kernel there is no width of it."""
-    fields = _fields(settings)
-    return fields | {"kernel_width": None} if settings.kernel == "none" else fields
+def _arguments(settings: Settings) -> dict[str, Any]:
+    """Of a method's factory: without a kernel there is no width of it."""
+    fields = values_of(type(settings), settings)
+    return fields | {"kernel_width": None} if fields.get("kernel") == "none" else fields

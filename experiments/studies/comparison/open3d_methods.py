@@ -1,8 +1,8 @@
 """Open3D's registrations as methods of the common contract, on the host.
 
 Each factory gives ``register(source, target, init, key) -> Registration`` with numpy leaves, so
-that one table holds these and the library's own. They cannot be jitted or vmapped. Needs
-``pip install 'vanejax[peers]'``.
+that one table holds these and the library's own. They cannot be jitted or vmapped. Lengths are in
+the clouds' unit. Needs ``pip install 'vanejax[peers]'``.
 """
 
 from __future__ import annotations
@@ -36,22 +36,14 @@ def icp(
 ) -> Register:
     """Open3D's ICP, with the settings of `vanejax.matching.baselines.icp.icp`.
 
-    Args:
-      metric: "point_to_point" or "point_to_plane".
-      max_iterations: at most.
-      max_distance: farthest partner of a point, in the clouds' unit.
-      kernel: weight of a pair by its residual: "none", or "huber" or "tukey" with point_to_plane.
-      kernel_width: of "huber" and "tukey", in the clouds' unit.
-      trim: 1; Open3D does not trim.
-
     Raises:
-      InputError: no Open3D, or what it cannot do.
+      InputError: no Open3D, or what it cannot do: to trim, or a kernel without point_to_plane.
     """
     open3d = _open3d()
     method = open3d.pipelines.registration
-    to_plane = metric == "point_to_plane"
     if metric not in ("point_to_point", "point_to_plane"):
         raise InputError(f"metric {metric!r} is unknown: point_to_point or point_to_plane")
+    to_plane = metric == "point_to_plane"
     losses = {"huber": method.HuberLoss, "tukey": method.TukeyLoss}
     if kernel != "none" and (kernel not in losses or not to_plane or kernel_width is None):
         raise InputError(
@@ -60,10 +52,9 @@ def icp(
         )
     if trim != 1:
         raise InputError(f"trim is {trim}: Open3D's ICP does not trim")
-    if kernel != "none":
-        estimation = method.TransformationEstimationPointToPlane(losses[kernel](kernel_width))
-    elif to_plane:
-        estimation = method.TransformationEstimationPointToPlane()
+    if to_plane:
+        loss = [] if kernel == "none" else [losses[kernel](kernel_width)]
+        estimation = method.TransformationEstimationPointToPlane(*loss)
     else:
         estimation = method.TransformationEstimationPointToPoint(False)
     criteria = method.ICPConvergenceCriteria(max_iteration=max_iterations)
@@ -76,22 +67,14 @@ def icp(
 
 
 def ransac(
-    *,
-    feature_radius: float,
-    max_distance: float,
-    edge_similarity: float = 0.9,
-    num_hypotheses: int = 100_000,
-    confidence: float = 0.999,
+    *, feature_radius: float, max_distance: float, num_hypotheses: int = 100_000
 ) -> Register:
-    """Open3D's RANSAC over FPFH matches, the relative of
-    `vanejax.matching.baselines.sac_ia.sac_ia`.
+    """Open3D's RANSAC over FPFH matches, the relative of `vanejax.matching.baselines.sac_ia`.
 
     Args:
-      feature_radius: of an FPFH neighbourhood, in the clouds' unit.
-      max_distance: farthest partner of an inlier, in the clouds' unit.
-      edge_similarity: least ratio of corresponding edges of a sample.
+      feature_radius: of an FPFH neighbourhood.
+      max_distance: farthest partner of an inlier.
       num_hypotheses: samples at most; Open3D's default.
-      confidence: that one sample was free of outliers, at which it stops.
 
     Raises:
       InputError: no Open3D.
@@ -101,21 +84,19 @@ def ransac(
 
     def align(source: Any, target: Any, start: np.ndarray) -> np.ndarray:
         del start  # features need no guess
-        features = [_features(open3d, cloud, feature_radius) for cloud in (source, target)]
-        checks = [
-            method.CorrespondenceCheckerBasedOnEdgeLength(edge_similarity),
-            method.CorrespondenceCheckerBasedOnDistance(max_distance),
-        ]
         result = method.registration_ransac_based_on_feature_matching(
             source,
             target,
-            *features,
+            *_features(open3d, (source, target), feature_radius),
             True,  # mutual matches only, where there are enough of them
             max_distance,
             method.TransformationEstimationPointToPoint(False),
             3,
-            checks,
-            method.RANSACConvergenceCriteria(num_hypotheses, confidence),
+            [
+                method.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+                method.CorrespondenceCheckerBasedOnDistance(max_distance),
+            ],
+            method.RANSACConvergenceCriteria(num_hypotheses, 0.999),
         )
         return result.transformation
 
@@ -126,19 +107,15 @@ def fgr(
     *,
     feature_radius: float,
     max_distance: float,
-    division: float = 1.4,
-    iterations: int = 64,
     tuple_similarity: float = 0.95,
     num_tuples: int = 1000,
 ) -> Register:
     """Open3D's Fast Global Registration, the relative of `vanejax.matching.baselines.fgr.fgr`.
 
     Args:
-      feature_radius: of an FPFH neighbourhood, in the clouds' unit.
-      max_distance: the width delta at which the scale of the robust kernel stays, in the clouds'
-        unit. Open3D compares its setting with the squared scale, so that it is given the square.
-      division: of the squared scale, every four iterations.
-      iterations: of Gauss-Newton.
+      feature_radius: of an FPFH neighbourhood.
+      max_distance: the width delta at which the scale of the robust kernel stays. Open3D compares
+        its setting with the squared scale, so that it is given the square.
       tuple_similarity: least ratio of corresponding edges of a triangle of matches.
       num_tuples: triangles at most.
 
@@ -150,18 +127,18 @@ def fgr(
 
     def align(source: Any, target: Any, start: np.ndarray) -> np.ndarray:
         del start  # features need no guess
-        features = [_features(open3d, cloud, feature_radius) for cloud in (source, target)]
         points = [np.asarray(cloud.points) for cloud in (source, target)]
         radius = max(np.linalg.norm(xyz - xyz.mean(axis=0), axis=-1).max() for xyz in points)
         option = method.FastGlobalRegistrationOption(
-            division_factor=division,
+            division_factor=1.4,
             use_absolute_scale=False,
             decrease_mu=True,
             maximum_correspondence_distance=(max_distance / max(radius, 1e-9)) ** 2,
-            iteration_number=iterations,
+            iteration_number=64,
             tuple_scale=tuple_similarity,
             maximum_tuple_count=num_tuples,
         )
+        features = _features(open3d, (source, target), feature_radius)
         result = method.registration_fgr_based_on_feature_matching(
             source, target, *features, option
         )
@@ -180,9 +157,9 @@ def _open3d() -> ModuleType:
     return open3d
 
 
-def _features(open3d: ModuleType, cloud: Any, radius: float) -> Any:
+def _features(open3d: ModuleType, clouds: tuple[Any, Any], radius: float) -> list[Any]:
     search = open3d.geometry.KDTreeSearchParamRadius(radius)
-    return open3d.pipelines.registration.compute_fpfh_feature(cloud, search)
+    return [open3d.pipelines.registration.compute_fpfh_feature(cloud, search) for cloud in clouds]
 
 
 def _cloud(open3d: ModuleType, cloud: PointCloud) -> Any:

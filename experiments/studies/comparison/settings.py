@@ -31,33 +31,19 @@ class IcpSettings(Settings):
 
 
 @settings_class
-class SacIaSettings(Settings):
-    """SAC-IA's; see `vanejax.matching.baselines.sac_ia.sac_ia`. Lengths in unit-sphere units."""
-
-    feature_radius: float = 0.3
-    max_distance: float = 0.1
-    num_hypotheses: int = 100_000
-    num_candidates: int = 3
-
-
-@settings_class
-class FgrSettings(Settings):
-    """FGR's; see `vanejax.matching.baselines.fgr.fgr`. Lengths in unit-sphere units."""
-
-    feature_radius: float = 0.3
-    max_distance: float = 0.05
-    num_candidates: int = 10
-    tuple_similarity: float = 0.9
-    num_tuples: int = 1000
-
-
-@settings_class
 class Open3dRansacSettings(Settings):
     """Open3D's RANSAC on FPFH; see `open3d_methods.ransac`. Unit-sphere units."""
 
     feature_radius: float = 0.3
     max_distance: float = 0.1
     num_hypotheses: int = 100_000
+
+
+@settings_class
+class SacIaSettings(Open3dRansacSettings):
+    """SAC-IA's; see `vanejax.matching.baselines.sac_ia.sac_ia`. Lengths in unit-sphere units."""
+
+    num_candidates: int = 3
 
 
 @settings_class
@@ -68,6 +54,14 @@ class Open3dFgrSettings(Settings):
     max_distance: float = 0.05
     tuple_similarity: float = 0.95
     num_tuples: int = 1000
+
+
+@settings_class
+class FgrSettings(Open3dFgrSettings):
+    """FGR's; see `vanejax.matching.baselines.fgr.fgr`. Lengths in unit-sphere units."""
+
+    tuple_similarity: float = 0.9
+    num_candidates: int = 10
 
 
 @settings_class

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from experiments.runner.markdown import table as markdown_table
+
 PEERS = {"icp": "open3d_icp", "sac_ia_icp": "open3d_ransac_icp", "fgr": "open3d_fgr"}
 MOST_ERROR = 1.1
 
@@ -31,14 +33,8 @@ def table(report: Mapping[str, Any]) -> str:
         f"{report['views']} test views of the {report['part']['name']}; mean / median / 95 %. "
         f"Within need: within {need['rotation_deg']:g} deg and {need['translation_mm']:g} mm.",
         "",
-        "| " + " | ".join(HEAD) + " |",
-        "|" + "---|" * len(HEAD),
+        markdown_table(HEAD, map(_cells, report["methods"])),
     ]
-    for method in report["methods"]:
-        if "skipped" in method:
-            lines.append(f"| {method['title']} | {method['skipped']} |" + " |" * (len(HEAD) - 2))
-        else:
-            lines.append("| " + " | ".join(_cells(method)) + " |")
     floor = next((m["alone"]["at_true_pose"] for m in report["methods"] if "alone" in m), None)
     if floor:
         lines += [
@@ -78,12 +74,12 @@ def beside_open3d(report: Mapping[str, Any]) -> list[str]:
 
 
 def _cells(method: Mapping[str, Any]) -> list[str]:
+    if "skipped" in method:
+        return [method["title"], method["skipped"], *[""] * (len(HEAD) - 2)]
     alone, refined, paper = method["alone"], method["refined"], method["paper"]
     figures = alone["summary"]
     published = (
-        ""
-        if paper is None
-        else f"{paper['rmse_mm']:.2f}, {paper['ffmde_mm']:.2f}, {paper['time_s']:.2g}"
+        "" if paper is None else "{rmse_mm:.2f}, {ffmde_mm:.2f}, {time_s:.2g}".format(**paper)
     )
     return [
         method["title"],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -141,29 +141,24 @@ def _of_scan(sweep: dict[str, Any]) -> str:
 def _conclusion(cad: Sequence[dict[str, Any]]) -> str:
     """The parts of the paper's argument, each where it holds."""
     e = TO_TELL
-    pairs = [(sweep["rmse_mm"], sweep["ffmde_abs_mm"], _noise(sweep)) for sweep in cad]
-    ranks = [
-        noise for rmse, face, noise in pairs if face["ranked_right"][e] > rmse["ranked_right"][e]
-    ]
-    steadier = [
-        noise
-        for rmse, face, noise in pairs
-        if face["coarsest_over_finest"][e] < rmse["coarsest_over_finest"][e]
-    ]
-    steady = [noise for _, face, noise in pairs if face["coarsest_over_finest"][e] < STEADY]
-    settled = [noise for _, face, noise in pairs if face["settled_from"][e] is not None]
+
+    def cases(holds: Callable[[dict[str, Any], dict[str, Any]], bool]) -> str:
+        where = [_noise(sweep) for sweep in cad if holds(sweep["rmse_mm"], sweep["ffmde_abs_mm"])]
+        if len(where) == len(cad):
+            return "in every case"
+        return f"only {' and '.join(where)}" if where else "in no case"
+
+    ranks = cases(lambda rmse, face: face["ranked_right"][e] > rmse["ranked_right"][e])
+    steadier = cases(
+        lambda rmse, face: face["coarsest_over_finest"][e] < rmse["coarsest_over_finest"][e]
+    )
+    settled = cases(lambda _, face: face["settled_from"][e] is not None)
+    steady = cases(lambda _, face: face["coarsest_over_finest"][e] < STEADY)
     return (
         f"So at a fixed error of {_pose(cad[0]['errors'][e])}, FFMDE ranks poses better than RMSE "
-        f"over unequal densities {_cases(ranks, cad)}; it changes less than RMSE "
-        f"{_cases(steadier, cad)}; it settles at some density "
-        f"{_cases(settled, cad)}; it is free of density {_cases(steady, cad)}."
+        f"over unequal densities {ranks}; it changes less than RMSE {steadier}; it settles at some "
+        f"density {settled}; it is free of density {steady}."
     )
-
-
-def _cases(where: Sequence[str], cad: Sequence[dict[str, Any]]) -> str:
-    if len(where) == len(cad):
-        return "in every case"
-    return f"only {' and '.join(where)}" if where else "in no case"
 
 
 def _noise(sweep: dict[str, Any]) -> str:

@@ -34,10 +34,10 @@ from experiments.studies.density.report import (
     table,
     verdict,
 )
+from experiments.studies.verdicts.report import area_under_roc
 from vanejax.errors import InputError
 from vanejax.matching.metrics import ffmde_abs, ffmde_signed, rmse
 from vanejax.plotting.canvas import save_figure
-from vanejax.rigid import RigidTransform
 from vanejax.training.pairs import PairSampling
 
 CAD_POINTS = tuple(2**power for power in range(8, 18))
@@ -50,13 +50,12 @@ METRICS = ("rmse_mm", "ffmde_abs_mm", "ffmde_signed_mm")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sweep:
-    """One cloud's number of points varied: S sizes, E pose errors, D draws.
+    """One cloud's number of points varied: S sizes, all E of `ERRORS`, D draws.
 
     Attributes:
       varied: "CAD" or "scan".
       cad_noise, scan_noise: standard deviations, unit-sphere units.
       cad_points, scan_points: [S].
-      errors: E of degrees and mm, the true pose first.
       values: of each of `METRICS` [S, E, D], mm.
     """
 
@@ -65,7 +64,6 @@ class Sweep:
     scan_noise: float
     cad_points: Sequence[int]
     scan_points: Sequence[int]
-    errors: Sequence[tuple[float, float]]
     values: dict[str, np.ndarray]
 
     @property
@@ -101,8 +99,7 @@ def _metrics(offsets: jax.Array, normals: jax.Array) -> dict[str, jax.Array]:
 def jittered(
     points: np.ndarray, noise: float, unit_mm: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Points [N, 3] mm with clipped normal noise on every coordinate, as `vanejax.training.pairs`
-    draws it.
+    """Points [N, 3] mm, each coordinate with the clipped normal noise of `vanejax.training.pairs`.
 
     ``noise`` is in unit-sphere units, ``unit_mm`` the length of one.
     """
@@ -121,16 +118,10 @@ def measure(
     draws: int,
     seed: int,
 ) -> Sweep:
-    """All draws of all views at all sizes; poses depend on view, draw and error only.
+    """All draws of all ``which`` views at all sizes; a scan with fewer points is taken whole.
 
-    Args:
-      views: of the part.
-      which: indices of the views.
-      varied: "CAD" or "scan": whose number of points the sizes are.
-      sizes: a scan that has fewer points is taken whole.
-      cad_noise, scan_noise: standard deviations, unit-sphere units.
-      draws: of each view: pose errors' directions, points and noise.
-      seed: of everything drawn.
+    Poses depend on view, draw and error only; each draw has its own points and noise (standard
+    deviations in unit-sphere units).
     """
     part, shape = views.part, (len(sizes), len(ERRORS), len(which) * draws)
     values = {name: np.empty(shape) for name in METRICS}
@@ -140,7 +131,9 @@ def measure(
     taken = [min(s if varied == "scan" else FIXED_SCAN, fewest) for s in sizes]
     label = f"{varied} points, noise {cad_noise:g} and {scan_noise:g}"
     for d, (view, draw) in enumerate(tqdm(list(itertools.product(which, range(draws))), label)):
-        poses = _poses(views, view, np.random.default_rng([seed, view, draw]))
+        rng = np.random.default_rng([seed, view, draw])
+        truth = views.truth(view)
+        poses = [perturb(truth, part, deg=deg, mm=mm, rng=rng) for deg, mm in ERRORS]
         for s, (num_cad, num_scan) in enumerate(zip(counts, taken, strict=True)):
             rng = np.random.default_rng([seed, view, draw, num_cad, num_scan])
             points, normals, _ = part.sample(num_cad, int(rng.integers(2**31)))
@@ -150,12 +143,7 @@ def measure(
             for e, pose in enumerate(poses):
                 for name, value in fit(pose.apply(scan), tree, normals.astype(np.float32)).items():
                     values[name][s, e, d] = value
-    return Sweep(varied, cad_noise, scan_noise, counts, taken, ERRORS, values)
-
-
-def _poses(views: VaneViews, view: int, rng: np.random.Generator) -> list[RigidTransform]:
-    truth = views.truth(view)
-    return [perturb(truth, views.part, deg=deg, mm=mm, rng=rng) for deg, mm in ERRORS]
+    return Sweep(varied, cad_noise, scan_noise, counts, taken, values)
 
 
 def slope(sizes: Sequence[int], means: np.ndarray) -> float:
@@ -180,34 +168,29 @@ def first_of_rest(sizes: Sequence[int], good: np.ndarray) -> int | None:
     return None if first == len(good) else int(sizes[first])
 
 
-def ranked_right(score: np.ndarray) -> np.ndarray:
+def ranked_right(score: np.ndarray) -> list[float]:
     """[E] how often a wrong pose scores above the true one, each at any of the sizes; ties half.
 
     The area under the ROC curve of a threshold for a density nobody controls, scores [S, E, D].
     """
-    true = np.sort(score[:, 0].ravel())
-    places = [
-        0.5 * (np.searchsorted(true, wrong, "left") + np.searchsorted(true, wrong, "right"))
-        for wrong in score.swapaxes(0, 1).reshape(score.shape[1], -1)
-    ]
-    return np.mean(places, axis=1) / len(true)
+    return [area_under_roc(score[:, e].ravel(), score[:, 0].ravel()) for e in range(len(score[0]))]
 
 
 def cancellation(sweep: Sweep) -> list[dict[str, float]]:
     """For each error: in how many draws of all sizes the signed FFMDE cancels, and the worst."""
-    signed, size = sweep.score("ffmde_signed_mm"), sweep.score("ffmde_abs_mm")
-    rows = []
-    for e in range(len(sweep.errors)):
-        ratio = (signed[:, e] / np.maximum(size[:, e], 1e-9)).ravel()
-        worst = int(np.argmin(ratio))
-        rows.append(
-            {
-                "share": float(np.mean(ratio < CANCELLED)),
-                "worst_signed_mm": float(signed[:, e].ravel()[worst]),
-                "worst_abs_mm": float(size[:, e].ravel()[worst]),
-            }
-        )
-    return rows
+    signed, size = (
+        sweep.score(metric).swapaxes(0, 1).reshape(len(ERRORS), -1)
+        for metric in ("ffmde_signed_mm", "ffmde_abs_mm")
+    )
+    ratio = signed / np.maximum(size, 1e-9)
+    return [
+        {
+            "share": float(np.mean(ratio[e] < CANCELLED)),
+            "worst_signed_mm": float(signed[e, worst]),
+            "worst_abs_mm": float(size[e, worst]),
+        }
+        for e, worst in enumerate(np.argmin(ratio, axis=1))
+    ]
 
 
 def summarize(sweep: Sweep, area_mm2: float) -> dict[str, Any]:
@@ -216,7 +199,7 @@ def summarize(sweep: Sweep, area_mm2: float) -> dict[str, Any]:
         "varied": sweep.varied,
         "cad_noise": sweep.cad_noise,
         "scan_noise": sweep.scan_noise,
-        "errors": [{"deg": deg, "mm": mm} for deg, mm in sweep.errors],
+        "errors": [{"deg": deg, "mm": mm} for deg, mm in ERRORS],
         "cad_points": list(sweep.cad_points),
         "scan_points": list(sweep.scan_points),
         "cad_spacing_mm": [float(np.sqrt(area_mm2 / count)) for count in sweep.cad_points],
@@ -224,7 +207,7 @@ def summarize(sweep: Sweep, area_mm2: float) -> dict[str, Any]:
         "cancellation": cancellation(sweep),
         "signed_mean_mm": sweep.values["ffmde_signed_mm"].mean(axis=2),
     }
-    errors, sizes = range(len(sweep.errors)), sweep.sizes
+    errors, sizes = range(len(ERRORS)), sweep.sizes
     for name in METRICS:
         score = sweep.score(name)
         mean, share = score.mean(axis=2), share_distinguished(score)

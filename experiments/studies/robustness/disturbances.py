@@ -52,9 +52,9 @@ class Series:
       name: for files, and ``title`` for readers.
       unit: of ``values``.
       values: strengths.
-      views: how many scans there are at each.
       take: ``take(value, number)`` makes scan ``number`` at this strength; same arguments, same
         bits.
+      views: how many scans there are at each.
       max_allowance_mm: of the fine registration: how much stock it may find; 0 for none.
       paper: the paper's mean RMSE and FFMDE over this series, mm, where it has one (Fig. 11).
     """
@@ -63,8 +63,8 @@ class Series:
     title: str
     unit: str
     values: Sequence[float]
-    views: int
     take: Callable[[float, int], Disturbed]
+    views: int
     max_allowance_mm: float = 0.0
     paper: tuple[float, float] | None = None
 
@@ -83,40 +83,27 @@ def make_series(part: Part, *, views: int, seed: int, sensor: str = "paper_camer
     distances_mm = (300.0, 350.0, 400.0, 450.0, 500.0, 600.0, 800.0, 1000.0)
     angles_deg = tuple(float(angle) for angle in range(0, 360, 10))
     saturated = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
+    chips, clamps = (0.0, 10.0, 20.0, 40.0, 80.0), (0.0, 1.0, 2.0, 3.0, 4.0)
+    noise_px = (0.0, 0.02, 0.05, 0.1, 0.2)
+    light, noise = "% of the pixels saturated", "px of disparity"
     table = (
         ("distance", "Distance", "mm", distances_mm, stand.at_distance),
         ("angle", "Angle", "deg", angles_deg, stand.at_angle),
-        ("light", "Strong light", "% of the pixels saturated", saturated, stand.in_light),
-        (
-            "chips",
-            "Chips and drops",
-            "of each on the part",
-            (0.0, 10.0, 20.0, 40.0, 80.0),
-            stand.among_chips,
-        ),
-        ("fixture", "Table and clamps", "clamps", (0.0, 1.0, 2.0, 3.0, 4.0), stand.in_fixture),
+        ("light", "Strong light", light, saturated, stand.in_light),
+        ("chips", "Chips and drops", "of each on the part", chips, stand.among_chips),
+        ("fixture", "Table and clamps", "clamps", clamps, stand.in_fixture),
         ("casting", "Casting allowance", "mm", stock_mm, stand.as_cast),
         ("stock", "The same, stock estimated", "mm", stock_mm, stand.as_cast),
-        (
-            "noise",
-            "Correlated noise",
-            "px of disparity",
-            (0.0, 0.02, 0.05, 0.1, 0.2),
-            stand.with_noise,
-        ),
+        ("noise", "Correlated noise", noise, noise_px, stand.with_noise),
     )
     return [
         Series(
-            name,
-            title,
-            unit,
-            values,
-            1 if name == "angle" else views,
-            take,
-            max_allowance_mm=1.0 if name == "stock" else 0.0,
-            paper=PAPER_MM.get(name),
+            *row,
+            views=1 if row[0] == "angle" else views,
+            max_allowance_mm=1.0 if row[0] == "stock" else 0.0,
+            paper=PAPER_MM.get(row[0]),
         )
-        for name, title, unit, values, take in table
+        for row in table
     ]
 
 
@@ -132,22 +119,19 @@ class _Stand:
         return self._scan(rng, self._pose(rng, distance_mm=distance_mm), distance_mm=distance_mm)
 
     def at_angle(self, azimuth_deg: float, number: int) -> Disturbed:
-        rng = self._rng(1, number, round(azimuth_deg))
         views = hemisphere_viewpoints(
             self.part.center,
             distance_mm=DISTANCE_MM,
             elevations_deg=(ELEVATION_DEG,),
             azimuths_deg=(azimuth_deg,),
         )
-        return self._scan(rng, views.view(0))
+        return self._scan(self._rng(1, number, round(azimuth_deg)), views.view(0))
 
     def in_light(self, percent: float, number: int) -> Disturbed:
         rng = self._rng(2, number)
-        pose = self._pose(rng)
-        sensor = saturating(
-            self.scanner, self.sensor.sample(rng), pose, percent / 100, seed=self.seed
-        )
-        return self._scan(rng, pose, sensor=sensor)
+        pose, sensor = self._pose(rng), self.sensor.sample(rng)
+        bright = saturating(self.scanner, sensor, pose, percent / 100, seed=self.seed)
+        return self._scan(rng, pose, sensor=bright)
 
     def among_chips(self, count: float, number: int) -> Disturbed:
         return self._cluttered(self._rng(3, number), Clutter(chips=int(count), drops=int(count)))
@@ -166,11 +150,9 @@ class _Stand:
 
     def with_noise(self, pixels: float, number: int) -> Disturbed:
         rng = self._rng(6, number)
-        pose = self._pose(rng)
-        sensor = dataclasses.replace(
-            self.sensor.sample(rng), correlated_px=pixels, correlation_px=40.0
-        )
-        return self._scan(rng, pose, sensor=sensor)
+        pose, sensor = self._pose(rng), self.sensor.sample(rng)
+        noisy = dataclasses.replace(sensor, correlated_px=pixels, correlation_px=40.0)
+        return self._scan(rng, pose, sensor=noisy)
 
     def _rng(self, *numbers: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, *numbers])

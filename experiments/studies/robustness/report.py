@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from experiments.runner.markdown import table as markdown_table
 from experiments.runner.required_accuracy import NEED_MM, within_need
+from experiments.runner.study_command import aligned
 from vanejax.plotting.canvas import (
     INK,
     OURS,
@@ -63,22 +64,19 @@ def series_lines(report: Report, series: Report) -> Iterator[list[str]]:
     """Cells of one series: a row for each strength and network."""
     for label, step in steps_of(series):
         rows = step["rows"]
-        for k, network in enumerate(networks(report)):
-            cells = [label, f"{_mean(rows, 'hole_share'):.0%}"] if not k else ["", ""]
-            cells.append(network)
+        first = [label, f"{np.mean([row['hole_share'] for row in rows]):.0%}"]
+        at_truth = [f"{np.mean([row['truth'][name] for row in rows]):.3f}" for name in METRICS]
+        for network in networks(report):
+            cells = [*first, network]
             for stage in STAGES:
-                turn, shift = (
-                    float(np.median(values(step, network, stage, name)))
-                    for name in ("rotation_deg", "translation_mm")
-                )
                 cells += [
-                    f"{turn:.3f}",
-                    f"{shift:.3f}",
-                    f"{share_within_need(step, network, stage):.0%}",
+                    f"{np.median(values(step, network, stage, name)):.3f}"
+                    for name in ("rotation_deg", "translation_mm")
                 ]
+                cells.append(f"{share_within_need(step, network, stage):.0%}")
             cells += [f"{np.mean(values(step, network, 'refined', name)):.3f}" for name in METRICS]
-            cells += [f"{np.mean([row['truth'][name] for row in rows]):.3f}" for name in METRICS]
-            yield cells
+            yield [*cells, *at_truth]
+            first = ["", ""]
 
 
 HEADERS = (
@@ -103,12 +101,8 @@ def table(report: Report) -> str:
     lines = []
     for series in report["series"]:
         rows = [list(HEADERS), *series_lines(report, series)]
-        widths = [max(len(row[k]) for row in rows) for k in range(len(HEADERS))]
         lines.append(f"{series['title']} ({series['unit']}){_paper(series)}")
-        lines += [
-            "  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
-            for row in rows
-        ]
+        lines += [f"  {line}" for line in aligned(rows)]
         lines.append("")
     if report["random"]:
         lines += [random_lines(report["random"]), ""]
@@ -150,10 +144,6 @@ def _paper(series: Report) -> str:
     return f"; paper: FFMDE {paper['ffmde_abs_mm']:.4f}, RMSE {paper['rmse_mm']:.4f} mm on average"
 
 
-def _mean(rows: list[Report], name: str) -> float:
-    return float(np.mean([row[name] for row in rows]))
-
-
 def picture(report: Report) -> Figure:
     """Translation errors under every disturbance, then the paper's Fig. 11: FFMDE and RMSE.
 
@@ -187,9 +177,8 @@ def picture(report: Report) -> Figure:
         0.98, 1.4 * NEED_MM, f"need: {NEED_MM:g} mm", transform=grid[0, 0].get_yaxis_transform(),
         ha="right", va="bottom", color=INK, fontsize=TICK_PT,
     )  # fmt: skip
-    handles = {
-        line.get_label(): line for axes in grid.flat for line in axes.lines
-    }  # some are in the panels of Fig. 11 alone
+    # some are in the panels of Fig. 11 alone
+    handles = {line.get_label(): line for axes in grid.flat for line in axes.lines}
     handles = [line for label, line in handles.items() if not label.startswith("_")]
     add_legend(figure, handles, loc="outside lower center", ncols=3)
     return figure

@@ -13,6 +13,7 @@ tables, robustness.json, and the paper's Fig. 11 drawn again in ``--out``.
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -90,10 +91,7 @@ class Trial:
         return row
 
     def _errors(self, scan: Disturbed, pose: RigidTransform) -> dict[str, float]:
-        error = pose_error(pose, scan.part_from_camera, self.part.center)
-        rotation_deg, translation_mm = magnitudes(error)
-        errors = {"rotation_deg": rotation_deg, "translation_mm": translation_mm}
-        return errors | self._fit(scan, pose)
+        return _pose_errors(pose, scan.part_from_camera, self.part) | self._fit(scan, pose)
 
     def _fit(self, scan: Disturbed, pose: RigidTransform) -> dict[str, float]:
         """RMSE and FFMDE (eqs 1, 2) of the thinned scan on the thinned surface of the part."""
@@ -102,34 +100,32 @@ class Trial:
         return {name: metrics[name] for name in ("rmse_mm", "ffmde_abs_mm")}
 
 
+def _pose_errors(pose: RigidTransform, truth: RigidTransform, part: Part) -> dict[str, float]:
+    rotation_deg, translation_mm = magnitudes(pose_error(pose, truth, part.center))
+    return {"rotation_deg": rotation_deg, "translation_mm": translation_mm}
+
+
 def _rough(truth: RigidTransform, part: Part, rng: np.random.Generator) -> RigidTransform:
     """A pose up to 45 deg and half a radius away from the true one."""
-    return perturb(
-        truth,
-        part,
-        deg=rng.uniform(0, START_DEG),
-        mm=rng.uniform(0, START_SHARE) * part.radius,
-        rng=rng,
-    )
+    deg, mm = rng.uniform(0, START_DEG), rng.uniform(0, START_SHARE) * part.radius
+    return perturb(truth, part, deg=deg, mm=mm, rng=rng)
 
 
 def run_series(trial: Trial, series: Series, seed: int) -> dict[str, Any]:
     """All scans of a series."""
-    todo = [(value, number) for value in series.values for number in range(series.views)]
-    rows: dict[float, list[dict[str, Any]]] = {value: [] for value in series.values}
-    for value, number in tqdm(todo, series.name, unit="scan"):
-        index = series.values.index(value)
+    todo = list(itertools.product(range(len(series.values)), range(series.views)))
+    steps: list[dict[str, Any]] = [{"value": value, "rows": []} for value in series.values]
+    for index, number in tqdm(todo, series.name, unit="scan"):
         rng = np.random.default_rng([seed, _STARTS, index, number])
-        scan = series.take(value, number)
-        rows[value].append(trial.row(scan, rng, max_allowance_mm=series.max_allowance_mm))
+        scan = series.take(series.values[index], number)
+        row = trial.row(scan, rng, max_allowance_mm=series.max_allowance_mm)
+        steps[index]["rows"].append(row)
     return {
         "name": series.name,
         "title": series.title,
         "unit": series.unit,
-        "paper": None
-        if series.paper is None
-        else {"rmse_mm": series.paper[0], "ffmde_abs_mm": series.paper[1]},
-        "steps": [{"value": value, "rows": of_value} for value, of_value in rows.items()],
+        "paper": series.paper and dict(zip(("rmse_mm", "ffmde_abs_mm"), series.paper, strict=True)),
+        "steps": steps,
     }
 
 
@@ -148,17 +144,16 @@ def run_random(part: Part, matcher: TrainedMatcher, count: int, seed: int) -> di
         began = time.perf_counter()
         result = register(scan, part, init=init, weights=matcher, seed=seed)
         seconds = time.perf_counter() - began
-        error = pose_error(result.part_from_camera, truth, part.center)
-        rotation_deg, translation_mm = magnitudes(error)
+        errors = _pose_errors(result.part_from_camera, truth, part)
+        right = errors["rotation_deg"] < RIGHT_DEG and errors["translation_mm"] < RIGHT_MM
         rows.append(
             {
                 "number": number,
                 "distance_mm": distance,
                 "hole_share": measured.hole_share,
                 "points": len(scan.points),
-                "rotation_deg": rotation_deg,
-                "translation_mm": translation_mm,
-                "right": bool(rotation_deg < RIGHT_DEG and translation_mm < RIGHT_MM),
+                **errors,
+                "right": right,
                 "verdict": result.verdict.status,
                 "reason": result.verdict.reason,
                 "sigma_mm": result.uncertainty.weakest_translation_sigma_mm,
@@ -170,18 +165,21 @@ def run_random(part: Part, matcher: TrainedMatcher, count: int, seed: int) -> di
 
 def summarize_random(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Shares and verdicts; only what is not right or not accepted is listed one by one."""
+    errors = {
+        name: np.array([row[name] for row in rows]) for name in ("rotation_deg", "translation_mm")
+    }
     return {
         "scans": len(rows),
         "right": sum(row["right"] for row in rows) / len(rows),
         **verdict_counts(rows),
         **{
             name: {
-                "mean": float(np.mean([row[name] for row in rows])),
-                "median": float(np.median([row[name] for row in rows])),
-                "p99": float(np.percentile([row[name] for row in rows], 99)),
-                "max": float(np.max([row[name] for row in rows])),
+                "mean": float(np.mean(error)),
+                "median": float(np.median(error)),
+                "p99": float(np.percentile(error, 99)),
+                "max": float(np.max(error)),
             }
-            for name in ("rotation_deg", "translation_mm")
+            for name, error in errors.items()
         },
         "seconds": study.spread([row["seconds"] for row in rows]),
         "listed": [row for row in rows if not row["right"] or row["verdict"] != "accepted"],

@@ -61,7 +61,7 @@ def made_up(scores: np.ndarray, *, signed: np.ndarray | None = None, **changes: 
     values["ffmde_signed_mm"] = scores if signed is None else signed
     counts = [4**k for k in range(4, 4 + len(scores))]
     given = {"varied": "CAD", "cad_noise": 0.0, "scan_noise": 0.0} | changes
-    return Sweep(cad_points=counts, scan_points=counts, errors=ERRORS, values=values, **given)
+    return Sweep(cad_points=counts, scan_points=counts, values=values, **given)
 
 
 def test_the_tree_finds_what_the_metrics_own_search_finds(views: VaneViews) -> None:
@@ -205,7 +205,7 @@ def test_the_verdict_follows_the_numbers() -> None:
     assert "settles at some density in no case" in refuted
     for found, says in ((good, "it does not matter"), (made_up(dense), "it matters too")):
         found.values["rmse_mm"] = found.values["ffmde_abs_mm"]
-        scan = Sweep("scan", 0.0, 0.0, [1] * 3, [1, 2, 4], ERRORS, found.values)
+        scan = Sweep("scan", 0.0, 0.0, [1] * 3, [1, 2, 4], found.values)
         assert says in verdict([summarize(good, 1.0), summarize(scan, 1.0)])
 
 
