@@ -10,11 +10,12 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
 
-from vanejax.cad.parametric_vane import GuideVaneSegment, guide_vane
+from vanejax.cad.parametric_vane import DOUBLET, GuideVaneSegment, guide_vane
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.cad.symmetry import (
     Axis,
@@ -30,6 +31,12 @@ from vanejax.rigid import RigidTransform
 X, Y, Z = np.eye(3)
 SEGMENTS = 96
 ONLY_IDENTITY = cyclic(1, Z)
+VANE = "vane_2"
+QUARTET = GuideVaneSegment(
+    vanes=4, vanes_per_ring=50, inner_radius_mm=255.0, outer_radius_mm=298.0, slot_width_mm=5.0
+)
+# and by how many pitches some of the vanes fall onto their neighbours
+VANES = {VANE: (DOUBLET, (-1, 1)), "vane_4": (QUARTET, (-2, -1, 1, 2))}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,14 +54,13 @@ class ChallengePart:
     part: Part
     symmetries: np.ndarray
     continuous_axis: Axis | None = None
-    also_tried: np.ndarray | None = None
+    also_tried: np.ndarray = dataclasses.field(default_factory=lambda: np.empty((0, 4, 4)))
 
     @functools.cached_property
     def near_symmetries(self) -> np.ndarray:
-        """[M, 4, 4] f64: motions that nearly map the part to itself; see `near_symmetries`.
+        """[M, 4, 4] f64: see `vanejax.cad.symmetry.near_symmetries`.
 
-        Up to exact symmetries: of `symmetries` times a near one, one is listed. Sought on first
-        use (0.5 to 5 s; the sphere 20 s).
+        Sought on first use (0.5 to 5 s; the sphere 20 s).
         """
         return near_symmetries(
             self.part,
@@ -66,10 +72,7 @@ class ChallengePart:
     def pose_error(
         self, part_from_camera: RigidTransform, truth: RigidTransform
     ) -> tuple[float, float]:
-        """Degrees and mm (at the part's centre) to the nearest right pose; both part_from_camera.
-
-        See `vanejax.cad.symmetry.pose_error`.
-        """
+        """Degrees and mm to the nearest right pose: `vanejax.cad.symmetry.pose_error`."""
         return pose_error(
             part_from_camera,
             truth,
@@ -80,26 +83,27 @@ class ChallengePart:
         )
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Design:
+class Design(NamedTuple):
     """A solid about its own origin, before it gets its place in the CAD frame."""
 
     solid: Manifold
-    symmetries: np.ndarray = dataclasses.field(default_factory=lambda: ONLY_IDENTITY)
+    symmetries: np.ndarray = ONLY_IDENTITY
     axis: np.ndarray | None = None
 
 
 def challenge_parts(names: Iterable[str] | None = None) -> dict[str, ChallengePart]:
     """The parts by name, all or those named; the same bits in every call.
 
+    `VANE` is not one of all: the guide vane of the other experiments.
+
     Raises:
-      InputError: a name that is none of `names_of_parts()`.
+      InputError: a name that is neither `VANE` nor one of `names_of_parts()`.
     """
     wanted = names_of_parts() if names is None else tuple(names)
-    unknown = sorted(set(wanted) - set(names_of_parts()))
+    unknown = sorted(set(wanted) - {VANE, *names_of_parts()})
     if unknown:
         raise InputError(f"no challenge part {unknown}; there are {names_of_parts()}")
-    return {name: _vane_quartet() if name == "vane_4" else _placed(name) for name in wanted}
+    return {name: _vanes(*VANES[name]) if name in VANES else _placed(name) for name in wanted}
 
 
 def names_of_parts() -> tuple[str, ...]:
@@ -122,19 +126,14 @@ def _placed(name: str) -> ChallengePart:
     )
 
 
-def _vane_quartet() -> ChallengePart:
-    """Four smaller vanes; one pitch on, three of the four fall onto their neighbours."""
-    segment = GuideVaneSegment(
-        vanes=4, vanes_per_ring=50, inner_radius_mm=255.0, outer_radius_mm=298.0, slot_width_mm=5.0
-    )
+def _vanes(segment: GuideVaneSegment, pitches: tuple[int, ...]) -> ChallengePart:
+    """Guide vanes; so many pitches on, some of them fall onto their neighbours."""
     part = guide_vane(segment)
     # the module's frame: x downstream along the engine's axis, z radially out, centred
-    corners = np.asarray(part.mesh.vertices)
-    middle = segment.inner_radius_mm + 0.5 * np.ptp(corners[:, 2])
-    axis_point = np.array([0.0, 0.0, -middle])
-    pitches = np.degrees(segment.pitch_rad) * np.array([-2, -1, 1, 2])
-    also = np.stack([rotation_about(X, p, axis_point) for p in pitches])
-    return ChallengePart(part=part, symmetries=ONLY_IDENTITY, also_tried=also)
+    middle = segment.inner_radius_mm + 0.5 * part.extent_mm[2]
+    angles = np.degrees(segment.pitch_rad) * np.array(pitches)
+    also = [rotation_about(X, angle, np.array([0.0, 0.0, -middle])) for angle in angles]
+    return ChallengePart(part=part, symmetries=ONLY_IDENTITY, also_tried=np.stack(also))
 
 
 def _designs() -> dict[str, Callable[[], Design]]:
@@ -156,7 +155,9 @@ def _designs() -> dict[str, Callable[[], Design]]:
         "shaft": functools.partial(_shaft, keyway=False),
         "shaft_keyway": functools.partial(_shaft, keyway=True),
         "spindle_flat": _spindle_flat,
-        "cross_hole_cylinder": _cross_hole_cylinder,
+        "cross_hole_cylinder": lambda: Design(
+            _rod(22, 90) - _rod(7, 60, axis="x"), dihedral(2, Z, X)
+        ),
         "connecting_rod": _connecting_rod,
         "hex_nut": _hex_nut,
         "elbow": _elbow,
@@ -304,10 +305,6 @@ def _spindle_flat() -> Design:
         solid - _box((20, 60, 30), (23, 0, 35)) - _box((20, 60, 30), (23, 0, -35)),
         cyclic(2, X),
     )
-
-
-def _cross_hole_cylinder() -> Design:
-    return Design(_rod(22, 90) - _rod(7, 60, axis="x"), dihedral(2, Z, X))
 
 
 def _connecting_rod() -> Design:

@@ -76,12 +76,7 @@ def summarize(
     judged: Sequence[Mapping[str, Any]], runs: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
     """ROC figures, and verdicts by kind of pose and by sensor."""
-    kinds = list(dict.fromkeys(row["kind"] for row in judged))
-    wrong_by_kind = {
-        kind: [row for row in judged if row["kind"] == kind and not row["right"]]
-        for kind in kinds
-        if kind != RIGHT
-    }
+    by_kind, by_sensor = _grouped(judged, "kind"), _grouped(judged, "sensor")
     figures = {}
     for name in FIGURES:
         right, wrong = figure_of(judged, name)
@@ -91,11 +86,11 @@ def summarize(
                 "true_accepts_at_no_false": float(np.mean(right > wrong.max())),
                 "curve": _corners(right, wrong),
                 "auc_by_kind": {
-                    kind: area_under_roc(right, figure_of(of_kind, name)[1])
-                    for kind, of_kind in wrong_by_kind.items()
+                    kind: area_under_roc(right, figure_of(rows, name)[1])
+                    for kind, rows in by_kind.items()
+                    if kind != RIGHT
                 },
             }
-    sensors = dict.fromkeys(row["sensor"] for row in judged)
     return {
         "poses": {
             "right": sum(row["right"] for row in judged),
@@ -103,27 +98,28 @@ def summarize(
             "truth_lost": sum(row["kind"] == RIGHT and not row["right"] for row in judged),
         },
         "figures": figures,
-        "verdicts_by_kind": {
-            kind: _verdicts([row for row in judged if row["kind"] == kind]) for kind in kinds
-        },
+        "verdicts_by_kind": {kind: _verdicts(rows) for kind, rows in by_kind.items()},
         "verdicts_by_sensor": {
             sensor: {
-                word: _verdicts(
-                    [r for r in judged if r["sensor"] == sensor and r["right"] is right]
-                )
+                word: _verdicts([row for row in rows if row["right"] is right])
                 for word, right in (("right", True), ("wrong", False))
             }
-            for sensor in sensors
+            for sensor, rows in by_sensor.items()
         },
-        "register": {
-            sensor: _outcomes([row for row in runs if row["sensor"] == sensor])
-            for sensor in dict.fromkeys(row["sensor"] for row in runs)
-        },
+        "register": {sensor: _outcomes(rows) for sensor, rows in _grouped(runs, "sensor").items()},
         "accepted_wrong": [
             row for row in judged if row["verdict"] == "accepted" and not row["right"]
         ],
         "registered": list(runs),
     }
+
+
+def _grouped(rows: Sequence[Mapping[str, Any]], name: str) -> dict[str, list[Mapping[str, Any]]]:
+    """Rows by their value of that name, in the order of the first ones."""
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(row[name], []).append(row)
+    return groups
 
 
 def verdict_counts(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -147,15 +143,15 @@ def _verdicts(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def _outcomes(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
     """What became of the registrations of one sensor."""
-    count = Counter((row["verdict"], row["right"]) for row in rows)
+    counts = verdict_counts(rows)["verdicts"]
     lists = [row for row in rows if row["verdict"] == "ambiguous"]
     return {
-        "accepted_right": count["accepted", True],
-        "accepted_wrong": count["accepted", False],
+        "accepted_right": counts["accepted"]["right"],
+        "accepted_wrong": counts["accepted"]["wrong"],
         "ambiguous": len(lists),
         "ambiguous_right_not_given": sum(not (r["right"] or r["right_listed"]) for r in lists),
-        "rejected_right": count["rejected", True],
-        "rejected_wrong": count["rejected", False],
+        "rejected_right": counts["rejected"]["right"],
+        "rejected_wrong": counts["rejected"]["wrong"],
     }
 
 

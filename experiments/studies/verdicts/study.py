@@ -20,13 +20,11 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.runner import study_command as study
-from experiments.studies.verdicts.challenge_parts import names_of_parts
+from experiments.studies.verdicts.challenge_parts import VANE, challenge_parts, names_of_parts
 from experiments.studies.verdicts.report import OTHER_PART, RIGHT, picture, summarize, table
 from experiments.studies.verdicts.wrong_poses import (
     SENSORS,
-    VANE,
     PosedScan,
-    parts_to_pose,
     posed_scan,
     wrong_poses,
 )
@@ -58,17 +56,14 @@ def judged_poses(scan: PosedScan, model: MeasurementModel, seed: int) -> Iterato
     kinds, guesses = zip((RIGHT, scan.truth), *wrong_poses(scan, rng), strict=True)
     refined = [refine(model, scan.points, guess, seed=seed) for guess in guesses]
     # the true pose stays in, whether it was kept or lost; what came back to it says nothing new
-    kept = np.array(
-        [k for k, r in enumerate(refined) if k == 0 or not scan.is_right(r.part_from_camera)]
-    )
+    kept = [k for k, r in enumerate(refined) if k == 0 or not scan.is_right(r.part_from_camera)]
     poses = stack(*(refined[k].part_from_camera for k in kept))
-    kept = kept[distinct(poses, model.part, len(kept))]
+    kept = np.array(kept)[distinct(poses, model.part, len(kept))]
     poses = stack(*(refined[k].part_from_camera for k in kept))
     poses = converge_fully(model, poses, compared_points(scan.points, seed))
     for k in kept:
         assessment = assess(model, scan.points, refined[k], poses, seed=seed)
-        right = scan.is_right(refined[k].part_from_camera)
-        yield _row(scan, kinds[k], refined[k], assessment, right=right, radius_mm=model.part.radius)
+        yield _row(scan, kinds[k], refined[k], assessment, model.part.radius)
 
 
 def other_part(scan: PosedScan, name: str, model: MeasurementModel, seed: int) -> dict[str, Any]:
@@ -80,9 +75,8 @@ def other_part(scan: PosedScan, name: str, model: MeasurementModel, seed: int) -
     poses = concatenate(stack(refinement.part_from_camera), others)
     poses = converge_fully(model, poses, compared_points(scan.points, seed))
     assessment = assess(model, scan.points, refinement, poses, seed=seed)
-    return _row(
-        scan, OTHER_PART, refinement, assessment, right=False, radius_mm=model.part.radius
-    ) | {"sought": name}
+    row = _row(scan, OTHER_PART, refinement, assessment, model.part.radius)
+    return row | {"sought": name}
 
 
 def registered(scan: PosedScan, seed: int) -> dict[str, Any]:
@@ -106,16 +100,12 @@ def registered(scan: PosedScan, seed: int) -> dict[str, Any]:
 
 
 def _row(
-    scan: PosedScan,
-    kind: str,
-    refinement: Refinement,
-    assessment: Assessment,
-    *,
-    right: bool,
-    radius_mm: float,
+    scan: PosedScan, kind: str, refinement: Refinement, assessment: Assessment, radius_mm: float
 ) -> dict[str, Any]:
-    angle, shift = np.nan, np.nan
+    """Of a pose of the part that was scanned, or (`OTHER_PART`) of one that is not there at all."""
+    right, (angle, shift) = False, (np.nan, np.nan)
     if kind != OTHER_PART:
+        right = scan.is_right(refinement.part_from_camera)
         angle, shift = scan.error(refinement.part_from_camera)
     verification = assessment.verification
     alone = judge(verification, assessment.uncertainty, (), radius_mm=radius_mm)
@@ -148,7 +138,7 @@ def measure(settings: argparse.Namespace) -> tuple[list[dict[str, Any]], list[di
     if unknown:
         raise InputError(f"no sensor {', '.join(unknown)}; there are {', '.join(SENSORS)}")
     names = settings.parts or (QUICK_PARTS if settings.quick else (VANE, *names_of_parts()))
-    parts = parts_to_pose(names)
+    parts = challenge_parts(names)
     models = {name: measurement_model(p.part, np.zeros(3)) for name, p in parts.items()}
     scans = [
         posed_scan(name, part, models[name].scanner, sensor, settings.seed + number)

@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from experiments.runner.vane_views import with_noise
-from experiments.studies.verdicts.challenge_parts import (
-    ONLY_IDENTITY,
-    ChallengePart,
-    X,
-    challenge_parts,
-)
+from experiments.studies.verdicts.challenge_parts import ChallengePart
 from experiments.studies.verdicts.depth_camera import KINDS, measure, random_pose
-from vanejax.cad.parametric_vane import DOUBLET, guide_vane
 from vanejax.cad.symmetry import rotation_about
 from vanejax.localization.fine_registration import subset
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera
 from vanejax.scanner.virtual_scanner import Scanner
 
-VANE = "vane_2"
 WHITE = "white"
 SENSORS = (WHITE, *KINDS)
 WHITE_MM = 0.1
@@ -68,18 +61,6 @@ class PosedScan:
         return angle < most_deg and shift < most_mm
 
 
-def parts_to_pose(names: Sequence[str]) -> dict[str, ChallengePart]:
-    """Challenge parts by name; `VANE` is the guide vane of the other experiments.
-
-    Raises:
-      InputError: a name that is none.
-    """
-    parts = challenge_parts([name for name in names if name != VANE])
-    if VANE in names:
-        parts[VANE] = _vane_doublet()
-    return {name: parts[name] for name in names}
-
-
 def posed_scan(
     name: str, challenge: ChallengePart, scanner: Scanner, sensor: str, seed: int
 ) -> PosedScan:
@@ -105,7 +86,7 @@ def wrong_poses(scan: PosedScan, rng: np.random.Generator) -> Iterator[tuple[str
     10 to 180 deg about a random axis.
     """
     challenge, part = scan.challenge, scan.challenge.part
-    for matrix in () if challenge.also_tried is None else challenge.also_tried:
+    for matrix in challenge.also_tried:
         yield "one pitch off", RigidTransform.from_matrix(matrix) @ scan.truth
     for matrix in challenge.near_symmetries[:NEAR_SYMMETRIES]:
         yield "near symmetry", RigidTransform.from_matrix(matrix) @ scan.truth
@@ -118,13 +99,3 @@ def wrong_poses(scan: PosedScan, rng: np.random.Generator) -> Iterator[tuple[str
         axis = rng.standard_normal(3)
         turn = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()
         yield "turned", RigidTransform(turn, part.center - turn @ part.center) @ scan.truth
-
-
-def _vane_doublet() -> ChallengePart:
-    """The guide vane; a pitch on, one vane falls onto its neighbour."""
-    part = guide_vane()
-    height = float(part.extent_mm[2])
-    axis_point = np.array([0.0, 0.0, -DOUBLET.inner_radius_mm - 0.5 * height])
-    pitch = np.degrees(DOUBLET.pitch_rad)
-    also = np.stack([rotation_about(X, angle, axis_point) for angle in (-pitch, pitch)])
-    return ChallengePart(part=part, symmetries=ONLY_IDENTITY, also_tried=also)

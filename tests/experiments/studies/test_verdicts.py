@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.studies.verdicts.challenge_parts import names_of_parts
+from experiments.studies.verdicts.challenge_parts import VANE, challenge_parts, names_of_parts
 from experiments.studies.verdicts.report import area_under_roc, picture, roc, summarize, table
 from experiments.studies.verdicts.study import (
     OTHER_PART,
@@ -20,10 +20,8 @@ from experiments.studies.verdicts.study import (
 from experiments.studies.verdicts.wrong_poses import (
     MOST_POINTS,
     SENSORS,
-    VANE,
     WHITE_MM,
     PosedScan,
-    parts_to_pose,
     posed_scan,
     wrong_poses,
 )
@@ -38,7 +36,7 @@ from vanejax.scans.measured_scan import MeasuredScan
 
 @pytest.fixture(scope="module")
 def parts():
-    return parts_to_pose([VANE, "pump_housing"])
+    return challenge_parts([VANE, "pump_housing"])
 
 
 @pytest.fixture(scope="module")
