@@ -16,8 +16,8 @@ from vanejax.matching.baselines.pointnetlk import PointNetLK
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.training import loss_terms as losses
+from vanejax.training.baseline_losses import PcrNetLoss, PointNetLKLoss, chamfer_loss, matrix_loss
 from vanejax.training.pairs import Pair, PairSampling, draw_pose
-from vanejax.training.pointnet_losses import PcrNetLoss, PointNetLKLoss, chamfer_loss, matrix_loss
 
 B, N, M = 4, 32, 40
 START = RigidTransform.identity()

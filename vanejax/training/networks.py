@@ -17,8 +17,7 @@ from vanejax.matching.contract import Register, Registration
 from vanejax.matching.fast_rpmnet import rpmnet
 from vanejax.matching.rpmnet import RpmNet, RpmNetSettings
 from vanejax.settings import positive, settings_class, values_of
-from vanejax.training.dcp_loss import DcpLoss
-from vanejax.training.pointnet_losses import PcrNetLoss, PointNetLKLoss
+from vanejax.training.baseline_losses import DcpLoss, PcrNetLoss, PointNetLKLoss
 from vanejax.training.rpmnet_loss import RpmNetLoss
 from vanejax.training.train_step import Loss, Variables
 
