@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -22,23 +22,18 @@ class Checkpoints:
     """
 
     def __init__(self, folder: str | os.PathLike[str], *, keep: int = 2) -> None:
-        policy = checkpoint_managers.AnyPreservationPolicy(
-            [
-                checkpoint_managers.LatestN(keep),
-                checkpoint_managers.BestN(
-                    get_metric_fn=_negative_score, n=1, keep_checkpoints_without_metrics=False
-                ),
-            ]
+        score = operator.itemgetter("score")
+        latest = checkpoint_managers.LatestN(keep)
+        best = checkpoint_managers.BestN(
+            get_metric_fn=score, reverse=True, n=1, keep_checkpoints_without_metrics=False
         )
-        self._manager = ocp.CheckpointManager(
-            Path(folder).absolute(),
-            options=ocp.CheckpointManagerOptions(
-                preservation_policy=policy,
-                best_fn=_negative_score,
-                best_mode="max",
-                enable_async_checkpointing=False,
-            ),
+        options = ocp.CheckpointManagerOptions(
+            preservation_policy=checkpoint_managers.AnyPreservationPolicy([latest, best]),
+            best_fn=score,
+            best_mode="min",
+            enable_async_checkpointing=False,
         )
+        self._manager = ocp.CheckpointManager(Path(folder).absolute(), options=options)
 
     def __enter__(self) -> Checkpoints:
         return self
@@ -59,8 +54,7 @@ class Checkpoints:
     def save(self, state: TrainState, *, score: float | None = None) -> None:
         """Writes the state under its step; does nothing where that step is there already.
 
-        Args:
-          score: what the best checkpoint is chosen by, lower is better; None if not measured.
+        The best checkpoint has the lowest ``score``; None is for one that was not measured.
         """
         step = int(state.step)
         if step in self._manager.all_steps():
@@ -72,8 +66,7 @@ class Checkpoints:
     def restore(self, like: TrainState, *, step: int | None = None) -> TrainState:
         """Reads a state; the latest one by default.
 
-        Args:
-          like: a state with the wanted structure, shapes and dtypes, such as `init_state` gives.
+        It has the structure, shapes and dtypes of the state ``like``, such as `init_state` gives.
 
         Raises:
           InputError: no checkpoint, one that cannot be read, or one of another model.
@@ -85,9 +78,10 @@ class Checkpoints:
         try:
             return self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
         except (ValueError, KeyError, TypeError, OSError) as error:
+            reason = str(error).strip().split("\n")[0][:200]
             raise InputError(
                 f"{self._manager.directory}/{step}: cannot be read as a state of this model; "
-                f"was it trained with another config? ({_first_line(error)})"
+                f"was it trained with another config? ({reason})"
             ) from error
 
 
@@ -100,11 +94,3 @@ def restore_or(folder: str | os.PathLike[str], fresh: TrainState, *, keep: int) 
 def all_finite(variables: Variables) -> bool:
     """Whether every number of a tree of arrays is finite."""
     return all(bool(np.isfinite(np.asarray(leaf)).all()) for leaf in jax.tree.leaves(variables))
-
-
-def _negative_score(metrics: dict[str, Any]) -> float:
-    return -float(metrics["score"])
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().split("\n")[0][:200]

@@ -66,11 +66,9 @@ class Bank(Protocol):
     @property
     def size(self) -> int:
         """How many entries there are."""
-        ...
 
     def draw(self, key: jax.Array, entries: jax.Array, sampling: PairSampling) -> Pair:
         """A batch from the entries [B] i32: sources [B, N] that share one target [M]."""
-        ...
 
 
 @settings_class
@@ -123,17 +121,15 @@ def make_bank(scan_set: ScanSet, *, num_reference: int) -> ScanBank:
     mask = np.arange(scan_set.points.shape[1])[None, :] < scan_set.counts[:, None]
     xyz = (part_from_camera.apply(scan_set.points.astype(np.float64)) - center) / radius
     normals = part_from_camera.rotate(scan_set.normals.astype(np.float64))
+    xyz, normals = (np.where(mask[..., None], rows, 0.0) for rows in (xyz, normals))
+    reference = PointCloud.create(
+        xyz=jnp.asarray((scan_set.reference_points - center) / radius, jnp.float32),
+        normals=jnp.asarray(scan_set.reference_normals, jnp.float32),
+    )
     return ScanBank(
-        scans=PointCloud(
-            xyz=jnp.asarray(np.where(mask[..., None], xyz, 0.0), jnp.float32),
-            normals=jnp.asarray(np.where(mask[..., None], normals, 0.0), jnp.float32),
-            mask=jnp.asarray(mask),
-        ),
+        scans=PointCloud(*(jnp.asarray(a, jnp.float32) for a in (xyz, normals)), jnp.asarray(mask)),
         source_sizes=jnp.asarray(source_sizes(scan_set, num_reference)),
-        reference=PointCloud.create(
-            xyz=jnp.asarray((scan_set.reference_points - center) / radius, jnp.float32),
-            normals=jnp.asarray(scan_set.reference_normals, jnp.float32),
-        ),
+        reference=reference,
     )
 
 
@@ -142,11 +138,8 @@ def draw_subset(key: jax.Array, cloud: PointCloud, size: jax.Array, rows: int) -
     order = jax.random.uniform(key, cloud.mask.shape)
     _, index = jax.lax.top_k(jnp.where(cloud.mask, order, -1.0), rows)
     mask = cloud.mask[index] & (jnp.arange(rows) < size)
-    return PointCloud(
-        xyz=jnp.where(mask[:, None], cloud.xyz[index], 0.0),
-        normals=jnp.where(mask[:, None], cloud.normals[index], 0.0),
-        mask=mask,
-    )
+    xyz, normals = (jnp.where(mask[:, None], a[index], 0.0) for a in (cloud.xyz, cloud.normals))
+    return PointCloud(xyz, normals, mask)
 
 
 def jitter(key: jax.Array, cloud: PointCloud, sampling: PairSampling) -> PointCloud:
@@ -170,10 +163,9 @@ def draw_pose(key: jax.Array, sampling: PairSampling) -> RigidTransform:
 def draw_target(key: jax.Array, bank: ScanBank, sampling: PairSampling) -> PointCloud:
     """A noisy reference [M]: one serves a whole batch of views."""
     subset_key, noise_key = jax.random.split(key)
-    size = jnp.asarray(sampling.num_reference)
-    return jitter(
-        noise_key, draw_subset(subset_key, bank.reference, size, sampling.num_reference), sampling
-    )
+    rows = sampling.num_reference
+    subset = draw_subset(subset_key, bank.reference, jnp.asarray(rows), rows)
+    return jitter(noise_key, subset, sampling)
 
 
 def draw_source(
@@ -191,18 +183,9 @@ def draw_source(
 
 
 def draw_pairs(key: jax.Array, bank: ScanBank, views: jax.Array, sampling: PairSampling) -> Pair:
-    """A batch that shares one reference.
-
-    Returns:
-      Pair with source [B, N] and target_from_source [B], and one target [M] for all of them.
-    """
+    """A batch: source [B, N] and target_from_source [B], and one target [M] for all of them."""
     target_key, source_key = jax.random.split(key)
     keys = jax.random.split(source_key, views.shape[0])
-    source, target_from_source = jax.vmap(lambda k, v: draw_source(k, bank, v, sampling))(
-        keys, views
-    )
-    return Pair(
-        source=source,
-        target=draw_target(target_key, bank, sampling),
-        target_from_source=target_from_source,
-    )
+    draw = jax.vmap(lambda key, view: draw_source(key, bank, view, sampling))
+    source, target_from_source = draw(keys, views)
+    return Pair(source, draw_target(target_key, bank, sampling), target_from_source)

@@ -51,7 +51,6 @@ class Loss(Protocol):
 
         The metrics hold ``rotation_error_deg`` and ``translation_error``.
         """
-        ...
 
 
 @settings_class
