@@ -1,16 +1,12 @@
 """Scan sets: thinning, labels, the split, and files that cannot be trusted."""
 
-import dataclasses
-import io
-import json
-import zipfile
-
 import numpy as np
 import pytest
 import trimesh
 
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.errors import InputError
+from vanejax.files import read_arrays, write_arrays
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
 from vanejax.training.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
 
@@ -101,62 +97,33 @@ def test_a_stale_file_names_what_differs(part: Part, scans: ScanSet, tmp_path) -
         load_scan_set(tmp_path / "scans.npz", expected=expected)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
-def test_a_truncated_file_is_refused(scans: ScanSet, tmp_path, share: float) -> None:
+def test_a_truncated_file_is_refused(scans: ScanSet, tmp_path) -> None:
     path = tmp_path / "scans.npz"
     scans.save(path)
-    data = path.read_bytes()
-    path.write_bytes(data[: int(share * len(data))])
+    path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(InputError, match="truncated or not a scan set"):
         load_scan_set(path)
 
 
-def test_a_changed_byte_is_noticed(scans: ScanSet, tmp_path) -> None:
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda arrays, header: header.clear(), "not a scan set of vanejax; delete"),
+        (lambda arrays, header: header.update(version=99), "of version 99, this program reads 1"),
+        (lambda arrays, header: header.pop("source"), "its header has no source"),
+        (lambda arrays, header: arrays.pop("points"), r"not a whole scan set \('points'\)"),
+        (lambda arrays, header: arrays.update(counts=arrays["counts"][1:]), "do not fit together"),
+        (lambda arrays, header: arrays.update(counts=0 * arrays["counts"]), "do not fit together"),
+    ],
+)
+def test_a_changed_file_is_refused_by_what_changed(scans, tmp_path, change, words: str) -> None:
     path = tmp_path / "scans.npz"
-    dataclasses.replace(scans, radius_mm=2.0).save(path)
-    arrays = dict(np.load(path))
-    arrays["points"][0, 0, 0] += 1.0
-    np.savez(path, **arrays)
-    with pytest.raises(InputError, match="checksum"):
-        load_scan_set(path)
-
-
-def _npy(array_header: dict) -> bytes:
-    buffer = io.BytesIO()
-    np.lib.format.write_array_header_1_0(buffer, array_header)
-    return buffer.getvalue()
-
-
-def test_a_huge_announced_array_is_refused_without_allocating(tmp_path) -> None:
-    path = tmp_path / "scans.npz"
-    header = {"shape": (10**6, 10**6, 10**6), "fortran_order": False, "descr": "<f4"}
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("points.npy", _npy(header) + b"1234")
-    with pytest.raises(InputError, match="does not hold the array that it announces"):
-        load_scan_set(path)
-
-
-def test_pickled_objects_are_refused(tmp_path) -> None:
-    path = tmp_path / "scans.npz"
-    np.savez(path, points=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(InputError, match="does not hold the array that it announces"):
-        load_scan_set(path)
-
-
-def test_other_npz_files_and_versions_are_refused(scans: ScanSet, tmp_path) -> None:
-    path = tmp_path / "scans.npz"
-    np.savez(path, points=np.zeros(3))
-    with pytest.raises(InputError, match="not a scan set of vanejax; delete"):
-        load_scan_set(path)
     scans.save(path)
-    arrays = dict(np.load(path))
-    header = json.loads(bytes(arrays["header"])) | {"version": 99}
-    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    np.savez(path, **arrays)
-    with pytest.raises(InputError, match="a scan set of version 99, this program reads 1"):
+    arrays, header = read_arrays(path)
+    change(arrays, header)
+    write_arrays(path, arrays, header)
+    with pytest.raises(InputError, match=words):
         load_scan_set(path)
-    with pytest.raises(InputError, match="no such file"):
-        load_scan_set(tmp_path / "none.npz")
 
 
 def test_a_voxel_that_leaves_nothing_is_refused(part: Part, scans: ScanSet) -> None:
