@@ -127,7 +127,7 @@ def test_cycle_loss_is_that_of_the_way_there_and_back():
     source, target = cloud(rng.normal(size=(N, 3)), 9), cloud(rng.normal(size=(M, 3)), 11)
     scores = np.where(np.outer(source.mask, target.mask), rng.normal(size=(N, M)), -1e9)
     match = Match(target_from_source=motion(5), scores=jnp.asarray(scores), partners=None)
-    partners = scipy.special.softmax(scores[:9, :11], axis=0).T @ source.xyz[:9]
+    partners = scipy.special.softmax(scores[:9, :11], axis=0).T @ np.asarray(source.xyz[:9])
     real = np.asarray(target.xyz[:11])
     turn, _ = Rotation.align_vectors(partners - partners.mean(axis=0), real - real.mean(axis=0))
     turn = turn.as_matrix()
