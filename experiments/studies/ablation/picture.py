@@ -12,14 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 from experiments.studies.ablation.table import CELL_TESTS, labels, shown, two_tests
-from vanejax.plotting.canvas import (
-    MARKERS,
-    SERIES,
-    WIDTH_IN,
-    add_legend,
-    new_figure,
-    style_chart,
-)
+from vanejax.plotting.canvas import MARKERS, SERIES, WIDTH_IN, add_legend, new_figure, style_chart
 
 ERRORS = (
     ("rotation_error_deg", "rotation error (deg)"),

@@ -8,11 +8,10 @@ import jax
 import numpy as np
 
 from experiments.runner.registrations import Results, measure
-from vanejax.cad.part import Part
-from vanejax.localization.fine_registration import refine
-from vanejax.localization.residuals import measurement_model
+from vanejax.cad import Part
+from vanejax.localization import measurement_model, refine
 from vanejax.rigid import RigidTransform
-from vanejax.training.dataset import ScanSet
+from vanejax.training import ScanSet
 
 
 class FineStep:
@@ -47,16 +46,10 @@ class FineStep:
         seconds = time.perf_counter() - start
         pose = self._in_units(refined.part_from_camera @ camera_from_source)
         measured = jax.device_get(measure(row.pairs, pose, self._scans.radius_mm))
-        errors, fit, fit_at_truth = measured
-        return row.replace(
-            registration=row.registration.replace(
-                target_from_source=pose, converged=np.asarray(refined.converged)
-            ),
-            errors=errors,
-            fit=fit,
-            fit_at_truth=fit_at_truth,
-            time_s=np.float64(seconds),
+        registration = row.registration.replace(
+            target_from_source=pose, converged=np.asarray(refined.converged)
         )
+        return Results(row.pairs, registration, *measured, time_s=np.float64(seconds))
 
     def _in_mm(self, target_from_source: RigidTransform) -> RigidTransform:
         """part_from_source of clouds in mm, f64: the unit sphere's centre is the part's."""

@@ -69,11 +69,6 @@ TABLE_1 = {
 def make_method(name: str, config: Comparison, network: Trained | None = None) -> Register:
     """A method of `experiments.studies.comparison.settings.METHODS`, jitted where it is ours.
 
-    Args:
-      name: of the method.
-      config: its settings.
-      network: where the method is one, its weights.
-
     Raises:
       InputError: settings that the method refuses, or an optional package that is missing.
     """

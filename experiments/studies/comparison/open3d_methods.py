@@ -21,8 +21,8 @@ from vanejax.rigid import RigidTransform
 
 FEWEST = 3  # points of a cloud, below which no pose is determined
 
-# from Open3D's two clouds and a start, 4 x 4, to the motion found, 4 x 4
-Align = Callable[[Any, Any, np.ndarray], np.ndarray]
+# from Open3D's two clouds and a start, 4 x 4, to Open3D's result
+Align = Callable[[Any, Any, np.ndarray], Any]
 
 
 def icp(
@@ -59,9 +59,8 @@ def icp(
         estimation = method.TransformationEstimationPointToPoint(False)
     criteria = method.ICPConvergenceCriteria(max_iteration=max_iterations)
 
-    def align(source: Any, target: Any, start: np.ndarray) -> np.ndarray:
-        result = method.registration_icp(source, target, max_distance, start, estimation, criteria)
-        return result.transformation
+    def align(source: Any, target: Any, start: np.ndarray) -> Any:
+        return method.registration_icp(source, target, max_distance, start, estimation, criteria)
 
     return _register(open3d, align, max_distance)
 
@@ -82,9 +81,9 @@ def ransac(
     open3d = _open3d()
     method = open3d.pipelines.registration
 
-    def align(source: Any, target: Any, start: np.ndarray) -> np.ndarray:
+    def align(source: Any, target: Any, start: np.ndarray) -> Any:
         del start  # features need no guess
-        result = method.registration_ransac_based_on_feature_matching(
+        return method.registration_ransac_based_on_feature_matching(
             source,
             target,
             *_features(open3d, (source, target), feature_radius),
@@ -98,7 +97,6 @@ def ransac(
             ],
             method.RANSACConvergenceCriteria(num_hypotheses, 0.999),
         )
-        return result.transformation
 
     return _register(open3d, align, max_distance)
 
@@ -125,7 +123,7 @@ def fgr(
     open3d = _open3d()
     method = open3d.pipelines.registration
 
-    def align(source: Any, target: Any, start: np.ndarray) -> np.ndarray:
+    def align(source: Any, target: Any, start: np.ndarray) -> Any:
         del start  # features need no guess
         points = [np.asarray(cloud.points) for cloud in (source, target)]
         radius = max(np.linalg.norm(xyz - xyz.mean(axis=0), axis=-1).max() for xyz in points)
@@ -139,10 +137,7 @@ def fgr(
             maximum_tuple_count=num_tuples,
         )
         features = _features(open3d, (source, target), feature_radius)
-        result = method.registration_fgr_based_on_feature_matching(
-            source, target, *features, option
-        )
-        return result.transformation
+        return method.registration_fgr_based_on_feature_matching(source, target, *features, option)
 
     return _register(open3d, align, max_distance)
 
@@ -184,7 +179,7 @@ def _register(open3d: ModuleType, align: Align, max_distance: float) -> Register
         enough = min(len(cloud.points) for cloud in clouds) >= FEWEST
         # its warning of few mutual matches comes with every second pair
         with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-            result = align(*clouds, start) if enough else start
+            result = align(*clouds, start).transformation if enough else start
         # where nothing was found, RANSAC and FGR answer with the identity
         converged = enough and np.isfinite(result).all()
         if not converged:

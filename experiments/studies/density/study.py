@@ -110,11 +110,11 @@ def jittered(
 def measure(
     views: VaneViews,
     which: Sequence[int],
-    *,
     varied: str,
     sizes: Sequence[int],
     cad_noise: float,
     scan_noise: float,
+    *,
     draws: int,
     seed: int,
 ) -> Sweep:
@@ -144,11 +144,6 @@ def measure(
                 for name, value in fit(pose.apply(scan), tree, normals.astype(np.float32)).items():
                     values[name][s, e, d] = value
     return Sweep(varied, cad_noise, scan_noise, counts, taken, values)
-
-
-def slope(sizes: Sequence[int], means: np.ndarray) -> float:
-    """Exponent p of ``mean ~ size^p``, fitted to the logarithms."""
-    return float(np.polyfit(np.log(sizes), np.log(np.maximum(means, 1e-9)), 1)[0])
 
 
 def share_distinguished(score: np.ndarray) -> np.ndarray:
@@ -216,7 +211,8 @@ def summarize(sweep: Sweep, area_mm2: float) -> dict[str, Any]:
         report[name] = {
             "mean": mean,
             "std": score.std(axis=2, ddof=1),
-            "slope": [slope(sizes, mean[:, e]) for e in errors],
+            # of the power law that the mean follows
+            "slope": np.polyfit(np.log(sizes), np.log(np.maximum(mean, 1e-9)), 1)[0],
             "coarsest_over_finest": mean[0] / np.maximum(mean[-1], 1e-9),
             "settled_from": [first_of_rest(sizes, settled[:, e]) for e in errors],
             "told_share": share,
@@ -239,17 +235,14 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     report = study.header("RMSE and FFMDE over density", settings, views.part)
     area = float(views.part.triangles.areas().sum())
     sweeps = []
-    for varied, sizes, cad_noise, scan_noise in (
+    for case in (
         ("CAD", CAD_POINTS, 0.0, 0.0),
         ("CAD", CAD_POINTS, NOISE, NOISE),
         ("CAD", CAD_POINTS, 0.0, NOISE),
         ("scan", SCAN_POINTS, 0.0, 0.0),
         ("scan", SCAN_POINTS, NOISE, NOISE),
     ):
-        sweep = measure(
-            views, which, varied=varied, sizes=sizes, cad_noise=cad_noise, scan_noise=scan_noise,
-            draws=settings.draws, seed=settings.seed,
-        )  # fmt: skip
+        sweep = measure(views, which, *case, draws=settings.draws, seed=settings.seed)
         sweeps.append(summarize(sweep, area))
         print(table(sweeps[-1]), end="\n\n")
     words = verdict(sweeps)

@@ -29,23 +29,18 @@ from experiments.studies.density.study import fit
 from experiments.studies.robustness import report as robustness_report
 from experiments.studies.robustness.disturbances import Disturbed, Series, make_series
 from experiments.studies.verdicts.report import verdict_counts
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.cad.part import Part
+from vanejax.cad import Part, guide_vane
 from vanejax.errors import InputError
-from vanejax.localization.fine_registration import refine
+from vanejax.localization import measurement_model, refine, register
 from vanejax.localization.matched_poses import match_poses
 from vanejax.localization.pose_batch import select, stack
-from vanejax.localization.registration import register
-from vanejax.localization.residuals import measurement_model
-from vanejax.plotting.canvas import save_figure
+from vanejax.plotting import save_figure
 from vanejax.pointcloud import voxel_thin
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.measurement import measure
-from vanejax.scanner.sensor import preset
-from vanejax.scanner.virtual_scanner import Scanner
-from vanejax.scans.measured_scan import MeasuredScan
+from vanejax.scanner import Scanner, measure, preset
+from vanejax.scans import MeasuredScan
+from vanejax.training import TrainedMatcher, find_weights
 from vanejax.training.online_scans import RandomViews
-from vanejax.training.weight_file import TrainedMatcher, find_weights
 
 SENSOR = "paper_camera"
 START_DEG, START_SHARE = 45.0, 0.5  # of the part's radius

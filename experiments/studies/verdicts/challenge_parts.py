@@ -15,16 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
 
+from vanejax.cad import Part, part_from_mesh
 from vanejax.cad.parametric_vane import DOUBLET, GuideVaneSegment, guide_vane
-from vanejax.cad.part import Part, part_from_mesh
-from vanejax.cad.symmetry import (
-    Axis,
-    cyclic,
-    dihedral,
-    near_symmetries,
-    pose_error,
-    rotation_about,
-)
+from vanejax.cad.symmetry import Axis, cyclic, dihedral, near_symmetries, pose_error, rotation_about
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
 
@@ -63,10 +56,7 @@ class ChallengePart:
         Sought on first use (0.5 to 5 s; the sphere 20 s).
         """
         return near_symmetries(
-            self.part,
-            self.symmetries,
-            continuous_axis=self.continuous_axis,
-            more=self.also_tried,
+            self.part, self.symmetries, continuous_axis=self.continuous_axis, more=self.also_tried
         )
 
     def pose_error(
@@ -143,8 +133,8 @@ def _designs() -> dict[str, Callable[[], Design]]:
         "l_bracket_near_equal": functools.partial(_bracket, 60.0, 61.0),
         "plate_extra_hole": functools.partial(square, extra=True),
         "plate_shifted_hole": functools.partial(odd, shift=2.0),
-        "box": functools.partial(_box_part, chamfer=0.0),
-        "box_chamfer": functools.partial(_box_part, chamfer=4.0),
+        "box": lambda: Design(_box((80, 60, 40), (0, 0, 0)), dihedral(2, Z, X)),
+        "box_chamfer": _box_chamfer,
         "u_channel": _u_channel,
         "t_piece": functools.partial(_t_piece, 45.0),
         "t_piece_uneven": functools.partial(_t_piece, 48.0),
@@ -202,15 +192,10 @@ def _polygon(corners: list[tuple[float, float]]) -> CrossSection:
     return CrossSection([np.asarray(corners, np.float64)])
 
 
-def _ring(count: int, radius: float, height: float = 0.0) -> list[tuple[float, float, float]]:
+def _ring(count: int, radius: float) -> list[tuple[float, float, float]]:
     """Places on a circle, the first on the x axis."""
     angles = 2 * math.pi * np.arange(count) / count
-    return [(radius * math.cos(a), radius * math.sin(a), height) for a in angles]
-
-
-def _repeated(solid: Manifold, count: int) -> Manifold:
-    """``count`` copies about z."""
-    return sum((solid.rotate((0, 0, 360 * i / count)) for i in range(count)), Manifold())
+    return [(radius * math.cos(a), radius * math.sin(a), 0.0) for a in angles]
 
 
 def _bracket(leg: float, other: float) -> Design:
@@ -237,12 +222,9 @@ def _plate(length: float, width: float, *, extra: bool = False, shift: float = 0
     return Design(solid)
 
 
-def _box_part(*, chamfer: float) -> Design:
-    solid = _box((80, 60, 40), (0, 0, 0))
-    if not chamfer:
-        return Design(solid, dihedral(2, Z, X))
-    bar = _box((100, chamfer * math.sqrt(2), chamfer * math.sqrt(2)), (0, 0, 0))
-    return Design(solid - bar.rotate((45, 0, 0)).translate((0, 30, 20)))
+def _box_chamfer() -> Design:
+    bar = _box((100, 4 * math.sqrt(2), 4 * math.sqrt(2)), (0, 0, 0)).rotate((45, 0, 0))
+    return Design(_box((80, 60, 40), (0, 0, 0)) - bar.translate((0, 30, 20)))
 
 
 def _u_channel() -> Design:
@@ -302,8 +284,7 @@ def _spindle_flat() -> Design:
     """The same at both ends, with a flat of 3 mm in the middle, towards +x."""
     solid = _rod(16, 110) + _rod(22, 14) + _rod(11, 150)
     return Design(
-        solid - _box((20, 60, 30), (23, 0, 35)) - _box((20, 60, 30), (23, 0, -35)),
-        cyclic(2, X),
+        solid - _box((20, 60, 30), (23, 0, 35)) - _box((20, 60, 30), (23, 0, -35)), cyclic(2, X)
     )
 
 
@@ -433,8 +414,9 @@ def _turbine_wheel(*, cut: bool) -> Design:
     section = CrossSection.square((26, 3.2), True).offset(0.6, JoinType.Round, 2.0, 16)
     blade = section.extrude(32, 12, 35.0).rotate((0, 90, 0)).translate((18, 0, 0))
     hub = _rod(24, 26, segments=120) + _rod(16, 40, (0, 0, 4), segments=120)
-    solid = hub + _repeated(blade.rotate((17, 0, 0)), 12)
-    solid -= _rod(8, 80, segments=120)
+    blade = blade.rotate((17, 0, 0))
+    blades = sum((blade.rotate((0, 0, 360 * i / 12)) for i in range(12)), Manifold())
+    solid = hub + blades - _rod(8, 80, segments=120)
     if not cut:
         return Design(solid, cyclic(12, Z))
     return Design(solid - _box((10, 30, 60), (52, 0, 0)))

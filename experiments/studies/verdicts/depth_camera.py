@@ -14,12 +14,11 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
-from vanejax.scanner import measurement
+from vanejax.scanner import Scanner, measurement
 from vanejax.scanner.sensor import Sensor, consumer_depth, paper_camera
-from vanejax.scanner.virtual_scanner import Scanner
 
 KINDS = ("structured_light", "depth_camera", "clutter")
 HOLES = (1, 5)  # round ones, in scans of the depth camera

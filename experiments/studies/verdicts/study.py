@@ -22,13 +22,9 @@ from tqdm import tqdm
 from experiments.runner import study_command as study
 from experiments.studies.verdicts.challenge_parts import VANE, challenge_parts, names_of_parts
 from experiments.studies.verdicts.report import OTHER_PART, RIGHT, picture, summarize, table
-from experiments.studies.verdicts.wrong_poses import (
-    SENSORS,
-    PosedScan,
-    posed_scan,
-    wrong_poses,
-)
+from experiments.studies.verdicts.wrong_poses import SENSORS, PosedScan, posed_scan, wrong_poses
 from vanejax.errors import InputError
+from vanejax.localization import MeasurementModel, judge, measurement_model, refine, register
 from vanejax.localization.assessment import (
     MOST_HYPOTHESES,
     Assessment,
@@ -36,14 +32,10 @@ from vanejax.localization.assessment import (
     compared_points,
     converge_fully,
 )
-from vanejax.localization.fine_registration import refine
 from vanejax.localization.pose_batch import concatenate, distinct, select, stack
 from vanejax.localization.pose_result import Refinement
 from vanejax.localization.pose_search import add_symmetry_hypotheses, search
-from vanejax.localization.registration import register
-from vanejax.localization.residuals import MeasurementModel, measurement_model
-from vanejax.localization.verdict import judge
-from vanejax.plotting.canvas import save_figure
+from vanejax.plotting import save_figure
 from vanejax.scans.measured_scan import MIN_POINTS, MeasuredScan
 
 QUICK_PARTS = (VANE, "vane_4", "flange_odd_hole", "box", "wedge")

@@ -14,8 +14,7 @@ from experiments.studies.verdicts.depth_camera import KINDS, measure, random_pos
 from vanejax.cad.symmetry import rotation_about
 from vanejax.localization.fine_registration import subset
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Camera, Scanner
 
 WHITE = "white"
 SENSORS = (WHITE, *KINDS)
