@@ -74,18 +74,6 @@ def test_every_method_is_compared_alone_and_refined(report: dict, folder: Path) 
         assert (folder / name).stat().st_size > 10_000
 
 
-def test_the_fine_step_leaves_a_pose_in_the_frame_it_came_in(report: dict) -> None:
-    """Rotation and translation alike: the noise of 0.7 mm on the points moves neither by 3 mm."""
-    icp_figures = report["methods"][0]
-    near = np.array(icp_figures["alone"]["rotation_error_deg"]) < 20
-    turned, moved = (
-        np.array(icp_figures["refined"][name])[near]
-        for name in ("rotation_error_deg", "translation_error_mm")
-    )
-    assert np.median(turned) < 3
-    assert np.median(moved) < 3
-
-
 def test_the_table_has_the_papers_figures_beside_ours(report: dict, folder: Path) -> None:
     text = table(report)
     assert (folder / "table.md").read_text() == text
@@ -96,14 +84,18 @@ def test_the_table_has_the_papers_figures_beside_ours(report: dict, folder: Path
     assert "2 steps" in text
 
 
-def test_a_finished_run_is_taken_instead_of_training(report: dict, folder: Path, capsys) -> None:
+def test_a_finished_run_is_taken_instead_of_training(report: dict, folder: Path) -> None:
     config = small()
     config.methods = ("pcrnet",)
+    config.training.pcrnet.steps = 99  # of a training that is not done here
     other = folder / "other"
-    again = compare(config, other, {"pcrnet": folder / "pcrnet"}, progress=False)
+    (again,) = compare(config, other, {"pcrnet": folder / "pcrnet"}, progress=False)["methods"]
     assert not (other / "pcrnet").exists()
-    alone = again["methods"][0]["alone"]
-    assert alone["rotation_error_deg"] == report["methods"][1]["alone"]["rotation_error_deg"]
+    alone = report["methods"][1]["alone"]
+    assert again["alone"]["rotation_error_deg"] == alone["rotation_error_deg"]
+    training = again["training"]
+    assert (training["steps"], training["wanted_steps"]) == (2, 2)
+    assert training["ended_by"] == "steps"
 
 
 def test_a_run_of_something_else_is_refused(report: dict, folder: Path) -> None:
@@ -219,13 +211,3 @@ def test_success_needs_both_errors_and_what_is_not_finite_is_none(report: dict) 
     assert told["converged"] == 0
     turned = results.errors.replace(rotation_deg=np.array([1.0, 91.0, 89.0, 180.0]))
     assert figures(results.replace(errors=turned), scans.test)["turned_over"] == 0.5
-
-
-def test_a_given_run_tells_how_it_was_trained_itself(report: dict, folder: Path) -> None:
-    config = small()
-    config.methods = ("pcrnet",)
-    config.training.pcrnet.steps = 99  # of a training that is not done here
-    told = compare(config, folder / "told", {"pcrnet": folder / "pcrnet"}, progress=False)
-    training = told["methods"][0]["training"]
-    assert (training["steps"], training["wanted_steps"]) == (2, 2)
-    assert training["ended_by"] == "steps"

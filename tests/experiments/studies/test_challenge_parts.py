@@ -13,7 +13,6 @@ from vanejax.cad.symmetry import (
     DenseSurface,
     cyclic,
     dihedral,
-    pose_error,
     rotation_about,
 )
 from vanejax.errors import InputError
@@ -147,14 +146,7 @@ def truth():
     return RigidTransform(rotation, np.array([12.0, -30.0, 240.0]))
 
 
-def test_every_symmetric_answer_has_no_error(parts, truth):
-    for name in ("gear", "box", "elbow", "star_knob"):
-        for symmetry in transforms(parts[name].symmetries):
-            error = parts[name].pose_error(symmetry @ truth, truth)
-            np.testing.assert_allclose(error, 0, atol=1e-6)  # arccos-free angle, f64
-
-
-@pytest.mark.parametrize("name", ["gear", "box", "l_bracket", "shaft"])
+@pytest.mark.parametrize("name", ["gear", "box", "elbow", "star_knob", "l_bracket", "shaft"])
 def test_pose_error_is_the_disturbance_whichever_symmetric_answer_was_found(parts, truth, name):
     challenge = parts[name]
     center = challenge.part.center
@@ -173,10 +165,3 @@ def test_turns_about_a_continuous_axis_are_free_but_a_flip_is_not(parts, truth):
         np.testing.assert_allclose(challenge.pose_error(found, truth), 0, atol=1e-6)
         flip = RigidTransform.from_matrix(rotation_about(np.array([1.0, 0, 0]), 180, point))
         assert challenge.pose_error(flip @ found, truth)[0] == pytest.approx(180)
-
-
-def test_pose_error_takes_the_nearest_symmetry_and_not_the_first(truth):
-    symmetries = cyclic(4, np.array([0.0, 0, 1]), np.zeros(3))
-    found = RigidTransform.from_matrix(rotation_about(np.array([0.0, 0, 1]), 93, np.zeros(3)))
-    error = pose_error(found @ truth, truth, symmetries, center=np.zeros(3), radius_mm=50.0)
-    np.testing.assert_allclose(error, (3.0, 0.0), atol=1e-6)

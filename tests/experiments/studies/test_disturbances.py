@@ -100,25 +100,14 @@ def test_correlated_noise_is_what_is_asked_for(series, model):
     assert loud > 1.5 * quiet
 
 
-def test_a_table_that_stays_counts_as_foreign(series, monkeypatch):
+def test_a_table_that_stays_counts_as_foreign(series, model, monkeypatch):
     def everything(points, part, **_):
         return Segments(np.full(len(points), Segment.PART, np.uint8), ())
 
     monkeypatch.setattr(disturbances, "segment", everything)
     scan = series["fixture"].take(0.0, 0)  # the table is all there is beside the part
     assert len(scan.points) == len(scan.measured.points)
-    on_table = np.isclose(deviations_from_table_mm(scan), 0, atol=1.0).mean()
-    assert scan.clutter_share == pytest.approx(on_table, abs=0.03)
+    # the rays of its points miss the part
+    hit = model.residuals(stack(scan.part_from_camera), scan.points).hit[0]
+    assert scan.clutter_share == pytest.approx(1 - hit.mean(), abs=0.03)
     assert scan.clutter_share > 0.3
-
-
-def deviations_from_table_mm(scan: Disturbed) -> np.ndarray:
-    """[N] heights above the plane that most of the outer pixels lie on, least squares, trimmed."""
-    points = scan.points
-    outer = points[np.linalg.norm(points[:, :2], axis=1) > 75]
-    for _ in range(5):
-        middle = outer.mean(axis=0)
-        normal = np.linalg.svd(outer - middle, full_matrices=False)[2][2]
-        height = (outer - middle) @ normal
-        outer = outer[np.abs(height) <= max(0.5, 2 * np.median(np.abs(height)))]
-    return (points - middle) @ normal
