@@ -38,14 +38,15 @@ def picture(report: Mapping[str, Any]) -> Figure:
             style_chart(axes, title=CELL_TESTS[test], xlabel=name, ylabel=f"mean {label}")
             places = _value_axis(axes, sweeps[0]["values"])
             for number, (words, line) in enumerate(_lines(points, fields).items()):
-                spreads = {
-                    places[json.dumps(point["overrides"][fields[0]])]: (
+                spreads = [
+                    (
+                        places[json.dumps(point["overrides"][fields[0]])],
                         point["tests"][test][measure]["mean"],
                         "budget" in point["ended_by"],
                     )
                     for point in line
                     if point["tests"][test]
-                }
+                ]
                 _draw(axes, spreads, number % len(SERIES), words)
             _error_axis(axes)
     if len(fields) > 1:
@@ -75,10 +76,10 @@ def _lines(
 
 
 def _draw(
-    axes: Axes, spreads: Mapping[float, tuple[Mapping[str, Any], bool]], number: int, label: str
+    axes: Axes, spreads: Sequence[tuple[float, Mapping[str, Any], bool]], number: int, label: str
 ) -> None:
-    """One line; ``spreads`` has the spread over the seeds, and whether a budget ended one, by x."""
-    known = sorted((x, *pair) for x, pair in spreads.items() if pair[0]["mean"] is not None)
+    """One line; ``spreads``: place, spread over the seeds, and whether a budget ended one."""
+    known = sorted(row for row in spreads if row[1]["mean"] is not None)
     color, marker = SERIES[number], MARKERS[number]
     x, means = [place for place, _, _ in known], [spread["mean"] for _, spread, _ in known]
     axes.plot(x, means, f"{marker}-", color=color, label=label, linewidth=1.2, markersize=4)

@@ -70,7 +70,7 @@ def error_shares(report: Mapping[str, Any]) -> Figure:
         style_chart(axes, xlabel=label)
         axes.set_xscale("log")
         for method in sorted(methods, key=lambda method: method["name"] in NAMED):
-            _share(axes, method["alone"][name], method["name"], method["title"])
+            _share(axes, method, name)
         refined = [_sorted(m["refined"][name]) for m in methods if m["refined"]["success"] >= 0.9]
         if refined:
             share = _steps(refined[0])
@@ -109,19 +109,16 @@ def _steps(values: np.ndarray) -> np.ndarray:
     return np.arange(1, len(values) + 1) / len(values)
 
 
-def _share(axes: Axes, errors: list[float | None], name: str, title: str) -> None:
+def _share(axes: Axes, method: Mapping[str, Any], error: str) -> None:
     """One curve; grey without a name where others say the same."""
-    values, style = _sorted(errors), METHODS[name]
-    named = name in NAMED
-    color = style.color if named else FAINT
-    axes.plot(
-        values, _steps(values), style.line, color=color, drawstyle="steps-post",
-        linewidth=1.5 if named else 0.7, label=title,
-    )  # fmt: skip
-    if named:
-        place = float(np.interp(NAMED[name], _steps(values), values))
+    values, style = _sorted(method["alone"][error]), METHODS[method["name"]]
+    shares, height = _steps(values), NAMED.get(method["name"])
+    color, width = (FAINT, 0.7) if height is None else (style.color, 1.5)
+    axes.plot(values, shares, style.line, color=color, drawstyle="steps-post", linewidth=width)
+    if height is not None:
+        place = (float(np.interp(height, shares, values)), height)
         axes.annotate(
-            title, (place, NAMED[name]), (4, 0), textcoords="offset points", color=color,
+            method["title"], place, (4, 0), textcoords="offset points", color=color,
             fontsize=LABEL_PT, va="center",
             bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none",
                   "alpha": 0.8},

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -19,6 +19,7 @@ from vanejax.scanner.virtual_scanner import Scanner
 from vanejax.scans.segmentation import segment
 from vanejax.training.online_scans import RandomViews
 
+SENSOR = "paper_camera"
 DISTANCE_MM = 400.0
 ELEVATION_DEG = 75.0
 BISECTIONS = 14
@@ -69,16 +70,12 @@ class Series:
     paper: tuple[float, float] | None = None
 
 
-def make_series(part: Part, *, views: int, seed: int, sensor: str = "paper_camera") -> list[Series]:
-    """All series on one part by cameras of one kind.
+def make_series(part: Part, *, views: int, seed: int) -> list[Series]:
+    """All series on one part that stands still, with so many scans at each strength.
 
-    Args:
-      part: stands still; cameras see it at `ELEVATION_DEG` and more.
-      views: scans at each strength; each is by another camera of the kind.
-      seed: of all.
-      sensor: a name of `vanejax.scanner.sensor.PRESETS`.
+    Each scan is by another camera of the kind `SENSOR`.
     """
-    stand = _Stand(part, preset(sensor), seed)
+    stand = _Stand(part, preset(SENSOR), seed)
     stock_mm = (0.0, 0.25, 0.5, 0.75, 1.0)
     distances_mm = (300.0, 350.0, 400.0, 450.0, 500.0, 600.0, 800.0, 1000.0)
     angles_deg = tuple(float(angle) for angle in range(0, 360, 10))
@@ -195,7 +192,7 @@ def saturating(
     """The sensor with the exposure time at which that share of its pixels saturates.
 
     This is how the paper makes holes (section III.E): exposure alone. 0 leaves it as it is. Found
-    by bisection at a quarter of the pixels per side.
+    at a quarter of the pixels per side.
     """
     if share <= 0:
         return sensor
@@ -206,14 +203,10 @@ def saturating(
         )
         return dataclasses.replace(sensor, exposure=exposure)
 
-    @functools.cache
     def saturated(stops: float) -> float:
         small = exposed(stops).scaled(0.25)
         reason = measure(scanner, small, pose, np.random.default_rng(seed)).reason
         return float(np.mean(reason == Reason.SATURATED))
 
-    low, high = -MOST_STOPS, MOST_STOPS
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if saturated(middle) < share else (low, middle)
-    return exposed(high)
+    stops = np.linspace(-MOST_STOPS, MOST_STOPS, 2**BISECTIONS + 1).tolist()
+    return exposed(stops[bisect.bisect_left(stops, share, 1, len(stops) - 1, key=saturated)])

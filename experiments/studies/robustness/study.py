@@ -27,7 +27,7 @@ from experiments.runner import study_command as study
 from experiments.runner.vane_views import magnitudes, perturb, pose_error
 from experiments.studies.density.study import fit
 from experiments.studies.robustness import report as robustness_report
-from experiments.studies.robustness.disturbances import Disturbed, Series, make_series
+from experiments.studies.robustness.disturbances import SENSOR, Disturbed, Series, make_series
 from experiments.studies.verdicts.report import verdict_counts
 from vanejax.cad import Part, guide_vane
 from vanejax.errors import InputError
@@ -42,7 +42,6 @@ from vanejax.scans import MeasuredScan
 from vanejax.training import TrainedMatcher, find_weights
 from vanejax.training.online_scans import RandomViews
 
-SENSOR = "paper_camera"
 START_DEG, START_SHARE = 45.0, 0.5  # of the part's radius
 RIGHT_DEG, RIGHT_MM, LEAST_RIGHT = 0.1, 0.15, 0.99
 _STARTS, _RANDOM = 0x57A7, 0x4A4D  # folded into the seed
@@ -204,7 +203,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     part = guide_vane()
     networks = {name: find_weights(path, part) for name, path in files.items()}
     trial = Trial(part, networks)
-    series = make_series(part, views=settings.views, seed=settings.seed, sensor=SENSOR)
+    series = make_series(part, views=settings.views, seed=settings.seed)
     report = study.header("RPM-Net, then ray casting", settings, part) | {
         "networks": {name: dict(matcher.trained) for name, matcher in networks.items()},
         "sensor": SENSOR,
