@@ -98,3 +98,8 @@ def pose_error(found: RigidTransform, truth: RigidTransform, center: np.ndarray)
 def magnitudes(error: np.ndarray) -> tuple[float, float]:
     """Degrees and mm of an error [6]."""
     return float(np.degrees(np.linalg.norm(error[:3]))), float(np.linalg.norm(error[3:]))
+
+
+def error_row(error: np.ndarray) -> dict[str, float]:
+    """`magnitudes` by their names in records."""
+    return dict(zip(("rotation_deg", "translation_mm"), magnitudes(error), strict=True))

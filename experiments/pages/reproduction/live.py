@@ -15,7 +15,7 @@ from experiments.pages.tables import MEASURES, evaluation_table
 from experiments.runner.experiment import Experiment
 from experiments.runner.markdown import table
 from experiments.studies.position import study as position
-from experiments.studies.position.report import magnitudes, moves_of, turns_of
+from experiments.studies.position.report import compared
 from experiments.train import load_or_scan
 from vanejax.errors import InputError
 from vanejax.training import TrainedMatcher
@@ -110,11 +110,10 @@ def check_recipe(matcher: TrainedMatcher, config: Experiment) -> None:
 
 def position_errors(report: Report) -> dict[str, dict[str, float]]:
     """Mean and largest error of all cameras' turns about the R axis and moves against the probe."""
-    errors = {
-        "turns": magnitudes(report, turns_of, "error_deg"),
-        "moves": magnitudes(report, moves_of, "against_probe_mm"),
+    return {
+        name: {"mean": float(errors.mean()), "max": float(errors.max())}
+        for name, errors in compared(report).items()
     }
-    return {name: {"mean": float(e.mean()), "max": float(e.max())} for name, e in errors.items()}
 
 
 def against_evaluation(record: Report | None, live: Live) -> str:

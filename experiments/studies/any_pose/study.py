@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from experiments.runner import study_command as study
-from experiments.runner.vane_views import VaneViews, magnitudes, pose_error, with_noise
+from experiments.runner.vane_views import VaneViews, error_row, pose_error, with_noise
 from experiments.studies.verdicts.report import verdict_counts
 from vanejax.localization.registration import register
 from vanejax.rigid import RigidTransform
@@ -52,14 +52,12 @@ def attempt(
     began = time.perf_counter()
     result = register(scan, views.part, weights=weights, seed=seed)
     seconds = time.perf_counter() - began
-    error = pose_error(result.part_from_camera, truth, views.part.center)
-    rotation_deg, translation_mm = magnitudes(error)
+    off = error_row(pose_error(result.part_from_camera, truth, views.part.center))
     return {
         "number": number,
         "view": view,
-        "rotation_deg": rotation_deg,
-        "translation_mm": translation_mm,
-        "right": bool(rotation_deg < RIGHT_DEG and translation_mm < RIGHT_MM),
+        **off,
+        "right": off["rotation_deg"] < RIGHT_DEG and off["translation_mm"] < RIGHT_MM,
         "verdict": result.verdict.status,
         "reason": result.verdict.reason,
         "score": result.verification.score,

@@ -10,7 +10,6 @@ Results: a table, fine.json and fine.png (basin.json) in ``--out``.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import itertools
 import time
 from collections.abc import Sequence
@@ -24,24 +23,11 @@ from scipy import stats
 from tqdm import tqdm
 
 from experiments.runner import study_command as study
-from experiments.runner.vane_views import VaneViews, magnitudes, perturb, pose_error, with_noise
+from experiments.runner.vane_views import VaneViews, error_row, perturb, pose_error, with_noise
+from vanejax.localization import RayCasting, refine
 from vanejax.localization.covariance import uncertainty
-from vanejax.localization.fine_registration import refine
 from vanejax.localization.pose_batch import stack
-from vanejax.localization.residuals import RayCasting
-from vanejax.plotting.canvas import (
-    FAINT,
-    INK,
-    OURS,
-    WIDTH_IN,
-    add_legend,
-    new_figure,
-    save_figure,
-    style_chart,
-)
-from vanejax.plotting.canvas import (
-    PAPER as PAPER_COLOR,
-)
+from vanejax.plotting import canvas
 from vanejax.rigid import RigidTransform
 
 NOISE_MM = (0.05, 0.1, 0.2, 0.5, 1.0)
@@ -50,42 +36,6 @@ MOST_RMS_RATIO, MOST_VIEW_RATIO = 1.3, 4.0
 BASIN_DEG, BASIN_MM, BASIN_NOISE_MM = (5.0, 10.0, 20.0, 30.0, 45.0), (5.0, 10.0, 20.0), 0.1
 BASIN_STRIDE = 3  # of the views: 18 of the 54
 ARRIVED_DEG, ARRIVED_MM = 0.05, 0.05
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Fit:
-    """One refinement of one view.
-
-    Attributes:
-      view: its index.
-      error: [6] rad and mm, see `experiments.runner.vane_views.pose_error`.
-      bound: [6, 6] the Cramer-Rao bound on the covariance of `error`.
-      covariance: [6, 6] what the refinement reports.
-      noise_mm: what it estimates.
-      converged, iterations, num_points: as it reports.
-      seconds: wall time.
-    """
-
-    view: int
-    error: np.ndarray
-    bound: np.ndarray
-    covariance: np.ndarray
-    noise_mm: float
-    converged: bool
-    iterations: int
-    num_points: int
-    seconds: float
-
-    @property
-    def bound_magnitudes(self) -> tuple[float, float]:
-        """The smallest possible rms error in deg and mm: roots of the bound's traces."""
-        turn, shift = np.trace(self.bound[:3, :3]), np.trace(self.bound[3:, 3:])
-        return float(np.degrees(np.sqrt(turn))), float(np.sqrt(shift))
-
-    @property
-    def squared(self) -> float:
-        """The error's normalised square, e^T C^-1 e; chi-square of 6 if the covariance is right."""
-        return float(self.error @ np.linalg.solve(self.covariance, self.error))
 
 
 def cramer_rao(
@@ -101,121 +51,116 @@ def cramer_rao(
     return np.linalg.inv(rows.T @ rows) * noise_mm**2
 
 
+def against_bound(error: np.ndarray, bound: np.ndarray, covariance: np.ndarray) -> dict[str, float]:
+    """An error [6], as `pose_error` has it, beside what was possible and what was reported.
+
+    Args:
+      error: rad, then mm.
+      bound: [6, 6], of `cramer_rao`; the roots of its traces are the least possible rms errors.
+      covariance: [6, 6], reported; ``squared`` is e^T C^-1 e, chi-square of 6 if it is right.
+    """
+    return {
+        **error_row(error),
+        "rotation_bound_deg": float(np.degrees(np.sqrt(np.trace(bound[:3, :3])))),
+        "translation_bound_mm": float(np.sqrt(np.trace(bound[3:, 3:]))),
+        "squared": float(error @ np.linalg.solve(covariance, error)),
+    }
+
+
 def refine_view(
     views: VaneViews,
     view: int,
     ideal: np.ndarray,
     *,
     noise_mm: float,
-    start_deg: float,
-    start_mm: float,
+    start: tuple[float, float],
     seed: int,
-) -> Fit:
-    """Adds noise to the ideal points [N, 3] of a view and refines from beside the true pose."""
+) -> dict[str, Any]:
+    """A row: noise is added to a view's ideal points [N, 3], which are then refined.
+
+    ``start`` is how far from the true pose that begins: degrees and mm.
+    """
     rng = np.random.default_rng([seed, view, round(1e6 * noise_mm)])  # levels are independent
     part, truth = views.part, views.truth(view)
-    start = perturb(truth, part, deg=start_deg, mm=start_mm, rng=rng)
+    beside = perturb(truth, part, deg=start[0], mm=start[1], rng=rng)
     points = with_noise(ideal, noise_mm, rng)
     began = time.perf_counter()
-    refinement = refine(views.model, points, start)
+    found = refine(views.model, points, beside)
     seconds = time.perf_counter() - began
-    return Fit(
-        view=view,
-        error=pose_error(refinement.part_from_camera, truth, part.center),
-        bound=cramer_rao(views.model, ideal, truth, noise_mm),
-        covariance=uncertainty(refinement, part.center).covariance,
-        noise_mm=refinement.noise_mm,
-        converged=refinement.converged,
-        iterations=refinement.iterations,
-        num_points=refinement.num_points,
-        seconds=seconds,
-    )
+    error = pose_error(found.part_from_camera, truth, part.center)
+    bound = cramer_rao(views.model, ideal, truth, noise_mm)
+    return {
+        "view": view,
+        **against_bound(error, bound, uncertainty(found, part.center).covariance),
+        "noise_mm": found.noise_mm,
+        "converged": found.converged,
+        "iterations": found.iterations,
+        "points": found.num_points,
+        "seconds": seconds,
+    }
 
 
-def summarize(fits: Sequence[Fit], noise_mm: float) -> dict[str, Any]:
+def summarize(rows: Sequence[dict[str, Any]], noise_mm: float) -> dict[str, Any]:
     """One noise level: errors against the bound, and whether the covariance says the truth."""
-    errors = np.array([magnitudes(fit.error) for fit in fits])
-    bounds = np.array([fit.bound_magnitudes for fit in fits])
-    squared = np.array([fit.squared for fit in fits])
-    count = 6 * len(fits)
-    report: dict[str, Any] = {"noise_mm": noise_mm, "views": len(fits)}
-    for k, name in enumerate(PAPER):
-        error, bound = (float(np.sqrt(np.mean(v[:, k] ** 2))) for v in (errors, bounds))
+    column = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    views, squared = len(rows), column["squared"]
+    report: dict[str, Any] = {"noise_mm": noise_mm, "views": views}
+    for name in PAPER:
+        each, least = column[name], column["_bound_".join(name.split("_"))]
+        error, bound = (float(np.sqrt(np.mean(values**2))) for values in (each, least))
         report[name] = {
             "rms": error,
-            "max": float(errors[:, k].max()),
+            "max": float(each.max()),
             "bound": bound,
             "ratio": error / bound,
-            "worst_view_ratio": float((errors[:, k] / bounds[:, k]).max()),
+            "worst_view_ratio": float((each / least).max()),
             "paper_mean": PAPER[name],
         }
+    tails = (0.025, 0.975)
     return report | {
         "anees": float(squared.mean() / 6),
-        "anees_interval_95": [stats.chi2.ppf(q, count) / count for q in (0.025, 0.975)],
+        "anees_interval_95": [stats.chi2.ppf(q, 6 * views) / (6 * views) for q in tails],
         "coverage_95": float(np.mean(squared < stats.chi2.ppf(0.95, 6))),
-        "coverage_interval_95": [
-            stats.binom.ppf(q, len(fits), 0.95) / len(fits) for q in (0.025, 0.975)
-        ],
-        "noise_estimate_ratio": float(np.mean([fit.noise_mm for fit in fits]) / noise_mm),
-        "converged": float(np.mean([fit.converged for fit in fits])),
-        "seconds": study.spread([fit.seconds for fit in fits]),
-        "points": study.spread([fit.num_points for fit in fits]),
-        "rows": [
-            {
-                "view": fit.view,
-                "rotation_deg": error[0],
-                "translation_mm": error[1],
-                "rotation_bound_deg": bound[0],
-                "translation_bound_mm": bound[1],
-                "squared": fit.squared,
-                "noise_mm": fit.noise_mm,
-                "converged": fit.converged,
-                "iterations": fit.iterations,
-                "points": fit.num_points,
-                "seconds": fit.seconds,
-            }
-            for fit, error, bound in zip(fits, errors, bounds, strict=True)
-        ],
+        "coverage_interval_95": [stats.binom.ppf(q, views, 0.95) / views for q in tails],
+        "noise_estimate_ratio": float(np.mean(column["noise_mm"]) / noise_mm),
+        "converged": float(np.mean(column["converged"])),
+        "seconds": study.spread([row["seconds"] for row in rows]),
+        "points": study.spread([row["points"] for row in rows]),
+        "rows": list(rows),
     }
 
 
 def measure(views: VaneViews, settings: argparse.Namespace) -> list[dict[str, Any]]:
     """All noise levels on the chosen views; `summarize` of each."""
-    fits: dict[float, list[Fit]] = {noise: [] for noise in settings.noise_mm}
+    rows: dict[float, list[dict[str, Any]]] = {noise: [] for noise in settings.noise_mm}
+    start = (settings.start_deg, settings.start_mm)
     for view in tqdm(views.select(settings.views), "refining", unit="view"):
         ideal = views.points(view)
-        for noise, of_noise in fits.items():
-            fit = refine_view(
-                views, view, ideal, noise_mm=noise, start_deg=settings.start_deg,
-                start_mm=settings.start_mm, seed=settings.seed,
-            )  # fmt: skip
-            of_noise.append(fit)
-    return [summarize(of_noise, noise) for noise, of_noise in fits.items()]
+        for noise, of_noise in rows.items():
+            of_noise.append(
+                refine_view(views, view, ideal, noise_mm=noise, start=start, seed=settings.seed)
+            )
+    return [summarize(of_noise, noise) for noise, of_noise in rows.items()]
 
 
 def basin(
     views: VaneViews, which: Sequence[int], seed: int, *, degrees: Sequence[float] = BASIN_DEG
 ) -> list[dict[str, Any]]:
     """For each size of the start: the share of the views that arrive within 0.05 deg, 0.05 mm."""
-    sizes = list(itertools.product(degrees, BASIN_MM))
-    arrived: dict[tuple[float, float], list[bool]] = {size: [] for size in sizes}
+    starts = list(itertools.product(degrees, BASIN_MM))
+    arrived: dict[tuple[float, float], list[bool]] = {start: [] for start in starts}
     for view in tqdm(which, "refining", unit="view"):
         ideal = views.points(view)
-        for number, (deg, mm) in enumerate(sizes):
-            fit = refine_view(
-                views, view, ideal, noise_mm=BASIN_NOISE_MM, start_deg=deg, start_mm=mm,
-                seed=seed + number,
-            )  # fmt: skip
-            turn, shift = magnitudes(fit.error)
-            arrived[deg, mm].append(turn < ARRIVED_DEG and shift < ARRIVED_MM)
+        for number, start in enumerate(starts):
+            row = refine_view(
+                views, view, ideal, noise_mm=BASIN_NOISE_MM, start=start, seed=seed + number
+            )
+            arrived[start].append(
+                row["rotation_deg"] < ARRIVED_DEG and row["translation_mm"] < ARRIVED_MM
+            )
     return [
-        {
-            "start_deg": deg,
-            "start_mm": mm,
-            "views": len(of_size),
-            "arrived": float(np.mean(of_size)),
-        }
-        for (deg, mm), of_size in arrived.items()
+        {"start_deg": deg, "start_mm": mm, "views": len(which), "arrived": float(np.mean(share))}
+        for (deg, mm), share in arrived.items()
     ]
 
 
@@ -279,41 +224,33 @@ def basin_table(rows: Sequence[dict[str, Any]]) -> str:
 def picture(levels: Sequence[dict[str, Any]]) -> Figure:
     """Errors over noise with the bound as a line, and how often the ellipsoid holds the truth."""
     noise = [level["noise_mm"] for level in levels]
-    figure = new_figure(WIDTH_IN, 2.8)
-    panels = figure.subplots(1, 3)
-    for axes, name, unit in zip(panels, PAPER, ("deg", "mm"), strict=False):
-        style_chart(
-            axes, title=f"{name.split('_')[0]} error", xlabel="noise along the ray (mm)",
-            ylabel=f"error ({unit})",
-        )  # fmt: skip
+    figure = canvas.new_figure(canvas.WIDTH_IN, 2.8)
+    *errors, covered = figure.subplots(1, 3)
+    for axes, (name, paper) in zip(errors, PAPER.items(), strict=True):
+        kind, unit = name.split("_")
         each = [[row[name] for row in level["rows"]] for level in levels]
         for x, values in zip(noise, each, strict=True):
-            axes.plot([x] * len(values), values, ".", color=FAINT, markersize=3, alpha=0.5)
-        axes.plot(noise, [level[name]["bound"] for level in levels], color=INK, label="bound")
-        axes.plot(
-            noise, [level[name]["rms"] for level in levels], "o", color=OURS, markersize=4,
-            label="ours, rms",
-        )  # fmt: skip
-        axes.axhline(PAPER[name], color=PAPER_COLOR, linestyle="--", label="paper, mean")
-        _noise_axis(axes, noise)
+            axes.plot([x] * len(values), values, ".", color=canvas.FAINT, markersize=3, alpha=0.5)
+        bound, rms = ([level[name][key] for level in levels] for key in ("bound", "rms"))
+        axes.plot(noise, bound, color=canvas.INK, label="bound")
+        axes.plot(noise, rms, "o", color=canvas.OURS, markersize=4, label="ours, rms")
+        axes.axhline(paper, color=canvas.PAPER, linestyle="--", label="paper, mean")
+        _over_noise(axes, noise, f"{kind} error", f"error ({unit})")
         axes.set_yscale("log")
-    style_chart(
-        panels[2], title="truth in the 95 % ellipsoid", xlabel="noise along the ray (mm)",
-        ylabel="share of the views",
-    )  # fmt: skip
     low, high = levels[0]["coverage_interval_95"]
-    panels[2].axhspan(low, high, color=FAINT, alpha=0.25, linewidth=0, label="95 % of chance")
     shares = [level["coverage_95"] for level in levels]
-    panels[2].plot(noise, shares, "o-", color=OURS, markersize=4)
-    _noise_axis(panels[2], noise)
-    panels[2].set_ylim(0, 1.03)
-    add_legend(panels[2], loc="lower left")
-    add_legend(figure, loc="outside lower left", ncols=3)
+    covered.axhspan(low, high, color=canvas.FAINT, alpha=0.25, linewidth=0, label="95 % of chance")
+    covered.plot(noise, shares, "o-", color=canvas.OURS, markersize=4)
+    _over_noise(covered, noise, "truth in the 95 % ellipsoid", "share of the views")
+    covered.set_ylim(0, 1.03)
+    canvas.add_legend(covered, loc="lower left")
+    canvas.add_legend(figure, loc="outside lower left", ncols=3)
     return figure
 
 
-def _noise_axis(axes: Axes, noise_mm: Sequence[float]) -> None:
-    """Logarithmic, with the levels themselves as ticks."""
+def _over_noise(axes: Axes, noise_mm: Sequence[float], title: str, ylabel: str) -> None:
+    """Labels, and a logarithmic axis with the noise levels themselves as ticks."""
+    canvas.style_chart(axes, title=title, xlabel="noise along the ray (mm)", ylabel=ylabel)
     axes.set_xscale("log")
     axes.set_xticks(noise_mm, [f"{level:g}" for level in noise_mm])
     axes.xaxis.set_minor_locator(NullLocator())
@@ -331,7 +268,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
         return report
     levels = measure(views, settings)
     report = study.save(settings.out, "fine", report | {"levels": levels})
-    save_figure(picture(levels), settings.out / "fine.png")
+    canvas.save_figure(picture(levels), settings.out / "fine.png")
     print(table(levels))
     return report
 

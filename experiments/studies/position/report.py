@@ -12,18 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from experiments.runner import markdown
-from vanejax.plotting.canvas import (
-    INK,
-    SERIES,
-    TICK_PT,
-    WIDTH_IN,
-    add_legend,
-    new_figure,
-    style_chart,
-)
-from vanejax.plotting.canvas import (
-    PAPER as PAPER_COLOR,
-)
+from vanejax.plotting import canvas
 
 Report = Mapping[str, Any]
 Rows = list[Report]
@@ -31,6 +20,8 @@ Rows = list[Report]
 PAPER = {"turns": (0.142, 0.32), "moves": (0.692, 0.85)}  # mean and maximum, Fig. 15
 GOAL = {"turns": 0.05, "moves": 0.1}  # mean, registration and calibration included
 STATUSES = ("accepted", "ambiguous", "rejected")
+PARTS, UNITS = ("pose", "motion"), ("deg", "mm")
+PREDICTED = (canvas.INK, ":", "predicted (one sigma)")
 
 # figures of turns and of moves: name in the rows, words, unit
 TURNS = {
@@ -76,27 +67,30 @@ def magnitudes(report: Report, rows_of: Callable[[Report], Rows], name: str) -> 
     )
 
 
+def compared(report: Report) -> dict[str, np.ndarray]:
+    """[cameras, rows] of the errors that have goals: of turns (deg) and of moves (mm)."""
+    return {
+        "turns": magnitudes(report, turns_of, "error_deg"),
+        "moves": magnitudes(report, moves_of, "against_probe_mm"),
+    }
+
+
 def is_met(report: Report) -> dict[str, bool]:
     """Whether the mean errors of turns and moves are within the goals."""
-    found = {
-        "turns": magnitudes(report, turns_of, "error_deg").mean(),
-        "moves": magnitudes(report, moves_of, "against_probe_mm").mean(),
-    }
-    return {name: bool(value <= GOAL[name]) for name, value in found.items()}
+    return {name: bool(e.mean() <= GOAL[name]) for name, e in compared(report).items()}
 
 
 def table(report: Report) -> str:
     """Everything, in Markdown."""
     cameras = report["cameras"]
-    verdicts = Counter(row["verdict"] for camera in cameras for row in singles_of(camera))
-    count = sum(verdicts.values())
-    seconds = [row["seconds"] for camera in cameras for row in singles_of(camera)]
+    rows = [row for camera in cameras for row in singles_of(camera)]
+    verdicts = Counter(row["verdict"] for row in rows)
     outcome = ", ".join(f"{verdicts[status]} {status}" for status in STATUSES)
     blocks = [
         _summary_table(report),
         f"Cameras of the kind `{report['sensor']}`: {len(cameras)}; positions turned and moved to: "
-        f"{report['positions']} each; {count} registrations ({report['method']}): {outcome}; "
-        f"{np.median(seconds):.2f} s each (median).",
+        f"{report['positions']} each; {len(rows)} registrations ({report['method']}): {outcome}; "
+        f"{np.median([row['seconds'] for row in rows]):.2f} s each (median).",
         _details(report),
         _predictions(report),
         _frames(report),
@@ -108,22 +102,17 @@ def table(report: Report) -> str:
 
 
 def _summary_table(report: Report) -> str:
-    met = is_met(report)
-    rows = []
-    for name, words, unit, rows_of, figure in (
-        ("turns", "rotation angle", "deg", turns_of, "error_deg"),
-        ("moves", "translation", "mm", moves_of, "against_probe_mm"),
-    ):
-        values = magnitudes(report, rows_of, figure)
-        rows.append(
-            [
-                f"{words} ({unit})",
-                f"{PAPER[name][0]:g} ({PAPER[name][1]:g})",
-                f"{values.mean():.3f} ({values.max():.3f})",
-                f"{GOAL[name]:g}",
-                "met" if met[name] else "MISSED",
-            ]
-        )
+    errors, met = compared(report), is_met(report)
+    rows = [
+        [
+            words,
+            f"{PAPER[name][0]:g} ({PAPER[name][1]:g})",
+            f"{errors[name].mean():.3f} ({errors[name].max():.3f})",
+            f"{GOAL[name]:g}",
+            "met" if met[name] else "MISSED",
+        ]
+        for name, words in (("turns", "rotation angle (deg)"), ("moves", "translation (mm)"))
+    ]
     return markdown.table(
         ["error, mean (maximum)", "paper", "here", "goal for the mean", "goal"], rows
     )
@@ -139,9 +128,8 @@ def _details(report: Report) -> str:
         for name, (words, unit) in figures.items():
             values = magnitudes(report, rows_of, name)
             means = values.mean(axis=1)
-            means_range = f"{means.min():.4f} to {means.max():.4f}"
-            row = [f"{title}{words} ({unit})", f"{values.mean():.4f}", f"{values.max():.4f}"]
-            rows.append([*row, means_range])
+            row = [f"{title}{words} ({unit})", *_digits(values.mean(), values.max())]
+            rows.append([*row, " to ".join(_digits(means.min(), means.max()))])
     away = np.mean([camera["machine_mm"] for camera in report["cameras"]])
     return (
         markdown.table(["error", "mean", "maximum", "means of the cameras"], rows)
@@ -151,20 +139,22 @@ def _details(report: Report) -> str:
     )
 
 
-def _rms(values: np.ndarray) -> float:
+def _digits(*values: float) -> list[str]:
+    return [f"{value:.4f}" for value in values]
+
+
+def _rms(values: Any) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _predictions(report: Report) -> str:
+    turned = ("error_deg", "sigma_noise_deg", "sigma_deg")
+    moved = ("against_truth_mm", "sigma_noise_mm", "sigma_mm")
     predicted = [
-        [words, *(f"{_rms(magnitudes(report, rows_of, name)):.4f}" for name in names)]
+        [words, *_digits(*(_rms(magnitudes(report, rows_of, name)) for name in names))]
         for words, rows_of, names in (
-            ("angle (deg)", turns_of, ("error_deg", "sigma_noise_deg", "sigma_deg")),
-            (
-                "translation against the truth (mm)",
-                moves_of,
-                ("against_truth_mm", "sigma_noise_mm", "sigma_mm"),
-            ),
+            ("angle (deg)", turns_of, turned),
+            ("translation against the truth (mm)", moves_of, moved),
         )
     ]
     head = ["root mean square", "error", "predicted from the scan's noise"]
@@ -172,12 +162,9 @@ def _predictions(report: Report) -> str:
     rows = []
     for kind in ("turns", "moves"):
         shares = [camera["bias"][kind] for camera in report["cameras"]]
-        for unit in ("deg", "mm"):
-            parts = [
-                _rms(np.array([share[f"{part}_{unit}"] for share in shares]))
-                for part in ("pose", "motion")
-            ]
-            rows.append([f"{kind} ({unit})", *(f"{value:.4f}" for value in parts)])
+        for unit in UNITS:
+            parts = (_rms([share[f"{part}_{unit}"] for share in shares]) for part in PARTS)
+            rows.append([f"{kind} ({unit})", *_digits(*parts)])
     head = ["what the camera's own calibration does, predicted", "to one pose", "to a motion"]
     return f"{noise}\n\n{markdown.table(head, rows)}"
 
@@ -190,83 +177,87 @@ def _frames(report: Report) -> str:
         ("mean", "mean of 8 matrices (the paper's way)"),
     ):
         found = [camera["calibration"][name] for camera in report["cameras"]]
-        means = [np.mean([row[figure] for row in found]) for figure in figures]
-        rows.append([words, *(f"{mean:.4f}" for mean in means)])
+        rows.append(
+            [words, *_digits(*(np.mean([row[figure] for row in found]) for figure in figures))]
+        )
     joint = [camera["calibration"]["joint"] for camera in report["cameras"]]
-    bias = {
-        unit: _rms(np.array([row[f"bias_sigma_{unit}"] for row in joint])) for unit in ("deg", "mm")
-    }
+    deg, mm = _digits(*(_rms([row[f"bias_sigma_{unit}"] for row in joint]) for unit in UNITS))
     head = ["camera to machine, mean of the cameras", "rotation (deg)", "at the cubes (mm)"]
     head += ["predicted (deg)", "(mm)", "left over (deg)", "(mm)"]
     return (
         markdown.table(head, rows)
         + "\n\nPredicted is without the camera's own calibration, whose share of the error is "
-        f"{bias['deg']:.4f} deg and {bias['mm']:.4f} mm (one standard deviation)."
+        f"{deg} deg and {mm} mm (one standard deviation)."
     )
 
 
 def picture(report: Report) -> Figure:
     """Fig. 15: errors at every position, the paper's figures, and what was predicted."""
-    figure = new_figure(WIDTH_IN, 4.2)
+    figure = canvas.new_figure(canvas.WIDTH_IN, 4.2)
     turned, moved = figure.subplots(1, 2)
-    first = report["cameras"][0]
-    errors = magnitudes(report, turns_of, "error_deg")
-    probe = magnitudes(report, moves_of, "against_probe_mm")
-    style_chart(
+    first, blue = report["cameras"][0], canvas.SERIES[0]
+    _panel(
         turned,
-        title=f"(a) angle about the R axis\n{_summary(errors, 'deg')}",
+        report,
+        "turns",
+        {
+            "error_deg": (blue, "-", "mean of the cameras"),
+            "whole_deg": (canvas.SERIES[2], "--", "whole rotation, mean of the cameras"),
+            "sigma_deg": PREDICTED,
+        },
+        each="each camera",
+        title="(a) angle about the R axis",
         xlabel="turned by (deg)",
-        ylabel="error (deg)",
+        ticks=[f"{row['true_deg'] % 360:g}" for row in turns_of(first)],
     )
-    labels = [f"{row['true_deg'] % 360:g}" for row in turns_of(first)]
-    turned.set_xticks(range(len(labels)), labels)
-    sigma = magnitudes(report, turns_of, "sigma_deg")
-    _points(turned, errors, SERIES[0], "each camera")
-    _means(turned, errors, SERIES[0], "-", "mean of the cameras")
-    whole = magnitudes(report, turns_of, "whole_deg")
-    _means(turned, whole, SERIES[2], "--", "whole rotation, mean of the cameras")
-    _means(turned, sigma, INK, ":", "predicted (one sigma)")
-    _levels(turned, PAPER["turns"], GOAL["turns"])
-
-    style_chart(
+    _panel(
         moved,
-        title=f"(b) translation, against the probe\n{_summary(probe, 'mm')}",
+        report,
+        "moves",
+        {
+            "against_probe_mm": (blue, "-", "against the probe, mean"),
+            "against_truth_mm": (canvas.SERIES[2], "--", "against the truth, mean"),
+            "known_frame_mm": (canvas.SERIES[1], "--", "the same with the true frame T_b"),
+            "origin_mm": (canvas.SERIES[3], "--", "eq. 13 as printed (machine's origin)"),
+            "sigma_mm": PREDICTED,
+        },
+        each="against the probe, each camera",
+        title="(b) translation, against the probe",
         xlabel="moved along X, Y, Z by (mm)",
-        ylabel="error (mm)",
+        ticks=["\n".join(f"{v:g}" for v in row["stage_mm"]) for row in moves_of(first)],
     )
-    labels = ["\n".join(f"{v:g}" for v in row["stage_mm"]) for row in moves_of(first)]
-    moved.set_xticks(range(len(labels)), labels)
-    _points(moved, probe, SERIES[0], "against the probe, each camera")
-    _means(moved, probe, SERIES[0], "-", "against the probe, mean")
-    for name, color, words in (
-        ("against_truth_mm", SERIES[2], "against the truth, mean"),
-        ("known_frame_mm", SERIES[1], "the same with the true frame T_b"),
-        ("origin_mm", SERIES[3], "eq. 13 as printed (machine's origin)"),
-    ):
-        _means(moved, magnitudes(report, moves_of, name), color, "--", words)
-    _means(moved, magnitudes(report, moves_of, "sigma_mm"), INK, ":", "predicted (one sigma)")
-    _levels(moved, PAPER["moves"], GOAL["moves"])
-    for axes in (turned, moved):
-        add_legend(axes, loc="upper center", bbox_to_anchor=(0.5, -0.27))
     return figure
 
 
-def _summary(values: np.ndarray, unit: str) -> str:
-    return f"mean {values.mean():.3f}, maximum {values.max():.3f} {unit}"
+def _panel(
+    axes: Axes,
+    report: Report,
+    kind: str,
+    lines: Mapping[str, tuple[str, str, str]],
+    *,
+    each: str,
+    title: str,
+    xlabel: str,
+    ticks: list[str],
+) -> None:
+    """Errors of turns or moves: dots of every camera, then means over the cameras as lines.
 
-
-def _points(axes: Axes, values: np.ndarray, color: str, label: str) -> None:
-    """Every value [cameras, positions] as a dot."""
-    places = np.broadcast_to(np.arange(values.shape[1]), values.shape)
+    ``lines`` has the colour, the line and the label of each figure.
+    """
+    errors, unit = compared(report)[kind], "deg" if kind == "turns" else "mm"
+    summary = f"mean {errors.mean():.3f}, maximum {errors.max():.3f} {unit}"
+    canvas.style_chart(axes, title=f"{title}\n{summary}", xlabel=xlabel, ylabel=f"error ({unit})")
+    axes.set_xticks(range(len(ticks)), ticks)
+    places = np.broadcast_to(np.arange(errors.shape[1]), errors.shape)
     axes.plot(
-        places.ravel(), values.ravel(), "o", color=color, alpha=0.35, markersize=3, label=label,
-        markeredgewidth=0,
+        places.ravel(), errors.ravel(), "o", color=canvas.SERIES[0], alpha=0.35, markersize=3,
+        label=each, markeredgewidth=0,
     )  # fmt: skip
-
-
-def _means(axes: Axes, values: np.ndarray, color: str, line: str, label: str) -> None:
-    """The mean of values [cameras, positions] over the cameras as a line."""
-    axes.plot(values.mean(axis=0), line, color=color, linewidth=1.2, label=label)
+    for name, (color, line, label) in lines.items():
+        means = magnitudes(report, turns_of if kind == "turns" else moves_of, name).mean(axis=0)
+        axes.plot(means, line, color=color, linewidth=1.2, label=label)
+    _levels(axes, PAPER[kind], GOAL[kind])
+    canvas.add_legend(axes, loc="upper center", bbox_to_anchor=(0.5, -0.27))
 
 
 def _levels(axes: Axes, paper: tuple[float, float], goal: float) -> None:
@@ -278,11 +269,11 @@ def _levels(axes: Axes, paper: tuple[float, float], goal: float) -> None:
         (paper[1], "--", "paper, maximum", "bottom"),
         (goal, "-.", "goal for the mean", "bottom"),
     ):
-        color = INK if words.startswith("goal") else PAPER_COLOR
+        color = canvas.INK if words.startswith("goal") else canvas.PAPER
         axes.axhline(value, linestyle=line, color=color, linewidth=1.2)
         axes.text(
             left, value * (1.04 if side == "bottom" else 0.96), f" {words} {value:g}",
-            ha="left", va=side, color=color, fontsize=TICK_PT,
+            ha="left", va=side, color=color, fontsize=canvas.TICK_PT,
         )  # fmt: skip
     axes.set_xlim(left)
     low, high = axes.get_ylim()

@@ -24,7 +24,7 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.runner import study_command as study
-from experiments.runner.vane_views import VaneViews, magnitudes, pose_error
+from experiments.runner.vane_views import VaneViews, error_row, pose_error
 from experiments.studies.position import report as position_report
 from experiments.studies.position.virtual_test_stand import (
     VirtualTestStand,
@@ -38,20 +38,9 @@ from experiments.studies.position.virtual_test_stand import (
 )
 from vanejax.errors import InputError
 from vanejax.localization.registration import register
-from vanejax.machine.calibration import Calibration
-from vanejax.machine.positioning import (
-    angle_sigma_deg,
-    camera_motion,
-    common_axis,
-    displacement,
-    displacement_covariance,
-    in_machine,
-    motion_errors,
-    probe_translation,
-    twist_about,
-    wrapped_deg,
-)
-from vanejax.plotting.canvas import save_figure
+from vanejax.machine import Calibration, MotionErrors, motion_errors, positioning
+from vanejax.machine.positioning import camera_motion, in_machine
+from vanejax.plotting import save_figure
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.sensor import Sensor, preset
 from vanejax.training.weight_file import TrainedMatcher, find_weights
@@ -80,6 +69,11 @@ class Found:
     verdict: str
     seconds: float
 
+    def row(self, center: np.ndarray) -> dict[str, Any]:
+        """Its errors at the part's centre, and what was said of it."""
+        errors = error_row(pose_error(self.pose, self.truth, center))
+        return errors | {"verdict": self.verdict, "seconds": self.seconds}
+
 
 def find(
     stand: VirtualTestStand,
@@ -96,38 +90,30 @@ def find(
     ``first`` is the initial position where it was found before; else it is scanned and searched.
     """
     found = [] if first is None else [first]
-    for number in range(len(found), len(positions)):
-        rng = np.random.default_rng([seed, _SCAN, salt, number])
-        scan = stand.scan(positions[number], rng)
-        init = None
-        if found:
-            init = found[0].pose @ stand.expected(positions[number]).inverse()
+    for number, stage in enumerate(positions[len(found) :], len(found)):
+        scan = stand.scan(stage, np.random.default_rng([seed, _SCAN, salt, number]))
+        init = found[0].pose @ stand.expected(stage).inverse() if found else None
         began = time.perf_counter()
         result = register(scan, stand.part, init=init, weights=weights, seed=seed)
         seconds = time.perf_counter() - began
         pose = result.part_from_camera
-        found.append(
-            Found(
-                pose,
-                stand.truth(positions[number]),
-                result.uncertainty.covariance,
-                pose_bias(stand, scan, pose, errors),
-                result.verdict.status,
-                seconds,
-            )
-        )
+        bias, covariance = pose_bias(stand, scan, pose, errors), result.uncertainty.covariance
+        status = result.verdict.status
+        found.append(Found(pose, stand.truth(stage), covariance, bias, status, seconds))
     return found
 
 
-def single(found: Found, center: np.ndarray) -> dict[str, Any]:
-    """What is known of one registration."""
-    rotation_deg, translation_mm = magnitudes(pose_error(found.pose, found.truth, center))
-    return {
-        "rotation_deg": rotation_deg,
-        "translation_mm": translation_mm,
-        "verdict": found.verdict,
-        "seconds": found.seconds,
-    }
+def covariances(
+    ways: MotionErrors,
+    first: Found,
+    other: Found,
+    calibration: np.ndarray | None = None,
+    frame_bias: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """[6, 6] of a motion's error: of the scans' noise, and with the camera's own calibration."""
+    noise = ways.covariance(first.covariance, other.covariance, calibration)
+    common = ways.common(first.bias, other.bias, frame_bias)
+    return noise, noise + common @ common.T
 
 
 def turn_rows(
@@ -137,34 +123,32 @@ def turn_rows(
 
     The angle is that about the axis which all measured turns share; the drawing gives its sign.
     """
-    motions = [camera_motion(found[0].pose, other.pose) for other in found[1:]]
-    axis = common_axis(np.stack([motion.rotation for motion in motions]))
-    if axis @ stand.axis < 0:
-        axis = -axis
+    first, *others = found
+    motions = [camera_motion(first.pose, other.pose) for other in others]
+    axis = positioning.common_axis(np.stack([motion.rotation for motion in motions]))
+    axis = -axis if axis @ stand.axis < 0 else axis
     rows = []
-    for stage, motion, other in zip(positions[1:], motions, found[1:], strict=True):
-        true_deg = twist_about(stage.rotation, np.array([0.0, 0.0, 1.0])).angle_deg
-        twist = twist_about(motion.rotation, axis)
-        ways = motion_errors(found[0].pose, other.pose, stand.part.center)
-        noise = ways.covariance(found[0].covariance, other.covariance)
-        common = ways.common(found[0].bias, other.bias)
-        both = noise + common @ common.T
-        whole = pose_error(motion, camera_motion(found[0].truth, other.truth), ways.center)
-        rotation_deg, translation_mm = magnitudes(whole)
+    for stage, motion, other in zip(positions[1:], motions, others, strict=True):
+        true_deg = positioning.twist_about(stage.rotation, np.array([0.0, 0.0, 1.0])).angle_deg
+        twist = positioning.twist_about(motion.rotation, axis)
+        ways = motion_errors(first.pose, other.pose, stand.part.center)
+        noise, both = covariances(ways, first, other)
+        whole = error_row(pose_error(motion, camera_motion(first.truth, other.truth), ways.center))
         rows.append(
             {
                 "true_deg": true_deg,
-                "error_deg": float(wrapped_deg(twist.angle_deg - true_deg)),
+                "error_deg": float(positioning.wrapped_deg(twist.angle_deg - true_deg)),
                 "swing_deg": twist.swing_deg,
-                "whole_deg": rotation_deg,
-                "whole_mm": translation_mm,
-                "sigma_deg": angle_sigma_deg(both, motion.rotation, axis),
-                "sigma_noise_deg": angle_sigma_deg(noise, motion.rotation, axis),
-                "single": single(other, stand.part.center),
+                "whole_deg": whole["rotation_deg"],
+                "whole_mm": whole["translation_mm"],
+                "sigma_deg": positioning.angle_sigma_deg(both, motion.rotation, axis),
+                "sigma_noise_deg": positioning.angle_sigma_deg(noise, motion.rotation, axis),
+                "single": other.row(stand.part.center),
             }
         )
     true_axis = stand.camera_from_stage.rotation[:, 2]
-    return {"axis_error_deg": _between_deg(axis, true_axis), "rows": rows}
+    between = np.arctan2(_length(np.cross(axis, true_axis)), axis @ true_axis)
+    return {"axis_error_deg": float(np.degrees(between)), "rows": rows}
 
 
 def move_rows(
@@ -186,50 +170,51 @@ def move_rows(
         stand.probed(stage, np.random.default_rng([seed, _PROBE, salt, number]))
         for number, stage in enumerate(positions)
     ]
+    first, center = found[0], stand.part.center
+
+    def way_of(motion: RigidTransform, frame: RigidTransform) -> tuple[np.ndarray, np.ndarray]:
+        """How far the part's centre came in a machine's frame, and where to."""
+        start = (frame @ first.pose.inverse()).apply(center[None])[0]
+        way = positioning.displacement(motion, start)
+        return way, start + way
+
     rows = []
     for stage, other, touched in zip(positions[1:], found[1:], probed[1:], strict=True):
-        seen = camera_motion(found[0].pose, other.pose)
-        true_seen = stand.moved(stage)
-        probe = probe_translation(probed[0], touched)
-        moved = {}
-        for name, frame in (
-            ("estimated", calibration.machine_from_camera),
-            ("known", stand.machine_from_camera),
-        ):
-            motion = in_machine(seen, frame)
-            start = (frame @ found[0].pose.inverse()).apply(stand.part.center[None])[0]
-            moved[name] = (motion, start, displacement(motion, start))
-        motion, start, way = moved["estimated"]
-        truth = in_machine(true_seen, stand.machine_from_camera).translation  # it turns nothing
+        seen = camera_motion(first.pose, other.pose)
+        true_motion = in_machine(stand.moved(stage), stand.machine_from_camera)
+        truth = true_motion.translation  # it turns nothing
+        probe = positioning.probe_translation(probed[0], touched)
+        motion = in_machine(seen, calibration.machine_from_camera)
+        way, arrived = way_of(motion, calibration.machine_from_camera)
+        known_motion = in_machine(seen, stand.machine_from_camera)
+        known_way, _ = way_of(known_motion, stand.machine_from_camera)
         ways = motion_errors(
-            found[0].pose,
+            first.pose,
             other.pose,
-            stand.part.center,
+            center,
             machine_from_camera=calibration.machine_from_camera,
             calibration_center=calibration.center,
         )
-        noise = ways.covariance(found[0].covariance, other.covariance, calibration.covariance)
-        common = ways.common(found[0].bias, other.bias, frame_bias)
-        sigmas = {}
-        for name, covariance in (("noise", noise), ("both", noise + common @ common.T)):
-            carried = displacement_covariance(covariance, ways.center, start + way)
-            sigmas[name] = float(np.sqrt(np.trace(carried)))
-        whole = pose_error(motion, in_machine(true_seen, stand.machine_from_camera), ways.center)
+        noise_mm, both_mm = (
+            float(np.sqrt(np.trace(positioning.displacement_covariance(c, ways.center, arrived))))
+            for c in covariances(ways, first, other, calibration.covariance, frame_bias)
+        )
+        whole = error_row(pose_error(motion, true_motion, ways.center))
         rows.append(
             {
                 "stage_mm": stage.translation,
-                "true_mm": float(np.linalg.norm(truth)),
+                "true_mm": _length(truth),
                 "against_probe_mm": _length(way - probe),
                 "against_truth_mm": _length(way - truth),
-                "known_frame_mm": _length(moved["known"][2] - truth),
+                "known_frame_mm": _length(known_way - truth),
                 "probe_mm": _length(probe - truth),
                 "distance_mm": _length(way) - _length(probe),
                 "origin_mm": _length(motion.translation - probe),
-                "whole_deg": magnitudes(whole)[0],
-                "whole_mm": magnitudes(whole)[1],
-                "sigma_mm": sigmas["both"],
-                "sigma_noise_mm": sigmas["noise"],
-                "single": single(other, stand.part.center),
+                "whole_deg": whole["rotation_deg"],
+                "whole_mm": whole["translation_mm"],
+                "sigma_mm": both_mm,
+                "sigma_noise_mm": noise_mm,
+                "single": other.row(center),
             }
         )
     return rows
@@ -239,17 +224,10 @@ def _length(vector: np.ndarray) -> float:
     return float(np.linalg.norm(vector))
 
 
-def _between_deg(first: np.ndarray, second: np.ndarray) -> float:
-    return float(np.degrees(np.arctan2(_length(np.cross(first, second)), first @ second)))
-
-
 def calibration_row(found: Calibration, stand: VirtualTestStand) -> dict[str, float]:
     """How good a calibration is, and how good it says it is."""
     error = pose_error(found.machine_from_camera, stand.machine_from_camera, found.center)
-    rotation_deg, translation_mm = magnitudes(error)
-    return {
-        "rotation_deg": rotation_deg,
-        "translation_mm": translation_mm,
+    return error_row(error) | {
         "sigma_deg": found.rotation_sigma_deg,
         "sigma_mm": found.translation_sigma_mm,
         "left_deg": float(np.mean(found.rotation_deg)),
@@ -258,42 +236,34 @@ def calibration_row(found: Calibration, stand: VirtualTestStand) -> dict[str, fl
     }
 
 
-def bias_shares(found: list[Found], center: np.ndarray) -> dict[str, float]:
-    """How much of what the camera's calibration does to a pose is left in a motion.
-
-    Root mean squares over the positions, predicted: of one pose, and of the motion from the first.
-    """
-
-    def rms(columns: list[np.ndarray]) -> tuple[float, float]:
-        both = np.stack(columns)
-        turn, shift = np.sum(both[:, :3] ** 2, axis=(1, 2)), np.sum(both[:, 3:] ** 2, axis=(1, 2))
-        return float(np.degrees(np.sqrt(turn.mean()))), float(np.sqrt(shift.mean()))
-
-    moved = [
-        motion_errors(found[0].pose, other.pose, center).common(found[0].bias, other.bias)
-        for other in found[1:]
-    ]
-    pose_deg, pose_mm = rms([other.bias for other in found])
-    motion_deg, motion_mm = rms(moved)
+def spread(name: str, biases: list[np.ndarray]) -> dict[str, float]:
+    """``name``_deg and ``name``_mm: what K causes [6, K] do together, rms over the biases."""
+    squares = np.mean(np.stack(biases) ** 2, axis=0).sum(axis=1)
     return {
-        "pose_deg": pose_deg,
-        "pose_mm": pose_mm,
-        "motion_deg": motion_deg,
-        "motion_mm": motion_mm,
+        f"{name}_deg": float(np.degrees(np.sqrt(squares[:3].sum()))),
+        f"{name}_mm": float(np.sqrt(squares[3:].sum())),
     }
 
 
+def bias_shares(found: list[Found], center: np.ndarray) -> dict[str, float]:
+    """How much of what the camera's calibration does to a pose is left in a motion.
+
+    Predicted, root mean squares over the positions: of one pose, and of the motion from the first.
+    """
+    first = found[0]
+    left = [
+        motion_errors(first.pose, other.pose, center).common(first.bias, other.bias)
+        for other in found[1:]
+    ]
+    return spread("pose", [each.bias for each in found]) | spread("motion", left)
+
+
 def run_camera(
-    views: VaneViews,
-    view: int,
-    *,
-    positions: int,
-    weights: TrainedMatcher | None,
-    seed: int,
+    views: VaneViews, view: int, *, positions: int, weights: TrainedMatcher | None, seed: int
 ) -> dict[str, Any]:
     """Both verifications and the calibration by one camera."""
     rng = np.random.default_rng([seed, _STAND, view])
-    kind = preset(SENSOR)
+    kind, center = preset(SENSOR), views.part.center
     camera_from_part = views.viewpoints.view(view)
     stand = VirtualTestStand.build(views.part, kind.sample(rng), camera_from_part, rng)
     errors = calibration_errors(kind)
@@ -304,45 +274,38 @@ def run_camera(
     placed = place_cubes(stand, np.random.default_rng([seed, _CUBE, view]))
     joint, mean = calibrations(placed)
     bias = frame_bias(placed, joint, errors)
-    joint_row = calibration_row(joint, stand)
-    spread = np.sum(bias**2, axis=1)
-    joint_row["bias_sigma_deg"] = float(np.degrees(np.sqrt(spread[:3].sum())))
-    joint_row["bias_sigma_mm"] = float(np.sqrt(spread[3:].sum()))
+    machine_from_part = stand.machine_from_camera @ camera_from_part
     return {
         "view": view,
-        "machine_mm": _length(
-            (stand.machine_from_camera @ camera_from_part).apply(stand.part.center[None])[0]
-        ),
-        "first": single(turns[0], stand.part.center),
+        "machine_mm": _length(machine_from_part.apply(center[None])[0]),
+        "first": turns[0].row(center),
         "rotation": turn_rows(stand, turned, turns),
         "translation": move_rows(stand, moved, moves, joint, bias, seed=seed, salt=view),
-        "calibration": {"joint": joint_row, "mean": calibration_row(mean, stand)},
-        "bias": {
-            "turns": bias_shares(turns, stand.part.center),
-            "moves": bias_shares(moves, stand.part.center),
+        "calibration": {
+            "joint": calibration_row(joint, stand) | spread("bias_sigma", [bias]),
+            "mean": calibration_row(mean, stand),
         },
+        "bias": {"turns": bias_shares(turns, center), "moves": bias_shares(moves, center)},
     }
 
 
 def main(settings: argparse.Namespace) -> dict[str, Any]:
     """All cameras, then the table and the picture."""
-    views = VaneViews()
+    views, positions = VaneViews(), settings.positions
     chosen = views.select(settings.views)
-    if settings.positions < 3:
-        raise InputError(f"--positions {settings.positions}: at least 3 are needed for an axis")
-    stage_moves(settings.positions)
+    if positions < 3:
+        raise InputError(f"--positions {positions}: at least 3 are needed for an axis")
+    stage_moves(positions)
     weights = None
     if settings.weights is not None:
         weights = find_weights(settings.weights, views.part)
     method = "ray casting" if weights is None else "RPM-Net, then ray casting"
+    given = {"positions": positions, "weights": weights, "seed": settings.seed}
     report = study.header(method, settings, views.part) | {
         "sensor": SENSOR,
-        "positions": settings.positions,
+        "positions": positions,
         "cameras": [
-            run_camera(
-                views, view, positions=settings.positions, weights=weights, seed=settings.seed
-            )
-            for view in tqdm(chosen, "cameras", unit="camera")
+            run_camera(views, view, **given) for view in tqdm(chosen, "cameras", unit="camera")
         ],
     }
     report = study.save(settings.out, "position", report)
