@@ -13,9 +13,10 @@ from experiments.runner.experiment import Experiment
 from experiments.runner.run_folder import RunFolder
 from vanejax.cad.part import Part
 from vanejax.training.dataset import ScanSet
-from vanejax.training.pairs import Bank, make_bank
+from vanejax.training.pairs import make_bank
 from vanejax.training.shape_pairs import ShapeBank
 from vanejax.training.shape_sets import load_shapes
+from vanejax.training.train_step import Bank
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,8 +11,8 @@ import numpy as np
 from experiments.runner.experiment import Experiment
 from vanejax.matching.metrics import pose_metrics
 from vanejax.rigid import RigidTransform
-from vanejax.training.pairs import Bank, PairSampling
-from vanejax.training.train_step import Metrics, TrainState, Variables
+from vanejax.training.pairs import PairSampling
+from vanejax.training.train_step import Bank, Metrics, TrainState, Variables
 
 
 def make_validation(

@@ -17,7 +17,7 @@ from vanejax.matching.baselines.pcrnet import PcrNet
 from vanejax.matching.baselines.pointnetlk import PointNetLK
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
-from vanejax.training import loss_terms as losses
+from vanejax.training import rpmnet_loss as losses
 from vanejax.training.baseline_losses import (
     DcpLoss,
     PcrNetLoss,

@@ -14,7 +14,7 @@ from vanejax.matching.se3 import exp_se3
 from vanejax.matching.sinkhorn import soft_correspondences
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
-from vanejax.training import loss_terms as losses
+from vanejax.training import rpmnet_loss as losses
 
 N, M = 5, 7
 SIGMA = 0.3

@@ -15,7 +15,7 @@ from vanejax.matching import fast_rpmnet
 from vanejax.matching.rpmnet import Match
 from vanejax.matching.se3 import exp_se3, rotation_angle
 from vanejax.pointcloud import PointCloud
-from vanejax.training import loss_terms as losses
+from vanejax.training import rpmnet_loss as losses
 from vanejax.training import train_step as training
 from vanejax.training.pairs import Pair, PairSampling, ScanBank
 from vanejax.training.rpmnet_loss import RpmNetLoss

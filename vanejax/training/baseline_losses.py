@@ -20,9 +20,9 @@ from vanejax.matching.metrics import nearest_offsets
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.settings import Settings, factor, not_negative, positive, settings_class
-from vanejax.training import loss_terms as losses
 from vanejax.training.gradient_sums import mean_over_pairs
 from vanejax.training.pairs import Pair
+from vanejax.training.rpmnet_loss import matching_loss, pose_loss
 from vanejax.training.train_step import Metrics, Variables
 
 
@@ -59,7 +59,7 @@ class DcpLoss(Settings):
       rotation: factor in `pose_parts`; 1 as in the paper, 1/9 in its code, which takes means.
       translation: factor in `pose_parts`; 1 as in the paper, 1/3 in its code.
       cycle: factor of `cycle_loss`; 0 as the published default, 0.1 in its option.
-      matching: factor of `losses.matching_loss`; 0 as published.
+      matching: factor of `matching_loss`; 0 as published.
       matching_sigma: its width, unit-sphere units.
     """
 
@@ -76,7 +76,7 @@ class DcpLoss(Settings):
         if self.cycle:
             parts["cycle"] = cycle_loss(match, pair.source, pair.target)
         if self.matching:
-            parts["matching"] = losses.matching_loss(
+            parts["matching"] = matching_loss(
                 match, pair.source, pair.target, truth, sigma=self.matching_sigma
             )
         return sum(getattr(self, name) * value for name, value in parts.items()), parts
@@ -181,7 +181,7 @@ class PcrNetLoss(_IterationsLoss):
     Attributes:
       iterations: of the network in training; 8 as published.
       discount: weight of an iteration relative to the next; 0 leaves the last alone.
-      pose: factor of `losses.pose_loss`; 0 as published.
+      pose: factor of `pose_loss`; 0 as published.
       chamfer: factor of `chamfer_loss`.
       pairs_at_once: see `mean_over_pairs`.
     """
@@ -194,7 +194,7 @@ class PcrNetLoss(_IterationsLoss):
 
     def of_iterations(self, steps: RigidTransform, pair: Pair) -> tuple[RigidTransform, Metrics]:
         """Poses [I] and parts [I]."""
-        pose = jax.vmap(losses.pose_loss, (0, None, None))
+        pose = jax.vmap(pose_loss, (0, None, None))
         parts = {"pose": pose(steps, pair.target_from_source, pair.source)}
         if self.chamfer:
             chamfer = jax.vmap(chamfer_loss, (0, None, None))

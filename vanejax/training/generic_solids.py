@@ -107,10 +107,6 @@ def _primitive(rng: Rng, size: float) -> tuple[Manifold, str]:
     return solid.transform(turn), name
 
 
-def _box(rng: Rng) -> Manifold:
-    return Manifold.cube(rng.uniform(0.25, 1.0, 3), True)
-
-
 def _cylinder(rng: Rng) -> Manifold:
     radius = rng.uniform(0.15, 0.6)
     return Manifold.cylinder(rng.uniform(0.2, 1.2), radius, radius, SEGMENTS)
@@ -121,18 +117,9 @@ def _cone(rng: Rng) -> Manifold:
     return Manifold.cylinder(rng.uniform(0.3, 1.2), radius, radius * rng.uniform(0, 0.7), SEGMENTS)
 
 
-def _torus(rng: Rng) -> Manifold:
-    thick = rng.uniform(0.2, 0.6)
-    return CrossSection.circle(thick, SEGMENTS // 2).translate((1.0, 0.0)).revolve(SEGMENTS)
-
-
 def _capsule(rng: Rng) -> Manifold:
     ball = Manifold.sphere(rng.uniform(0.2, 0.6), SEGMENTS // 2)
     return Manifold.batch_hull([ball, ball.translate((0, 0, rng.uniform(0.2, 1.2)))])
-
-
-def _prism(rng: Rng) -> Manifold:
-    return _polygon(rng).extrude(rng.uniform(0.2, 1.5))
 
 
 def _twisted_prism(rng: Rng) -> Manifold:
@@ -151,13 +138,18 @@ def _polygon(rng: Rng) -> CrossSection:
     return CrossSection([np.stack([reach * np.cos(angles), reach * np.sin(angles)], axis=1)])
 
 
+def _torus(rng: Rng) -> Manifold:
+    ring = CrossSection.circle(rng.uniform(0.2, 0.6), SEGMENTS // 2)
+    return ring.translate((1.0, 0.0)).revolve(SEGMENTS)
+
+
 _PRIMITIVES: dict[str, Callable[[Rng], Manifold]] = {
-    "box": _box,
+    "box": lambda rng: Manifold.cube(rng.uniform(0.25, 1.0, 3), True),
     "cylinder": _cylinder,
     "cone": _cone,
     "torus": _torus,
     "capsule": _capsule,
-    "prism": _prism,
+    "prism": lambda rng: _polygon(rng).extrude(rng.uniform(0.2, 1.5)),
     "twisted prism": _twisted_prism,
 }
 

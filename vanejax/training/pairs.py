@@ -6,8 +6,6 @@ is JAX code driven by a key, so that the same key gives the same pair on any mac
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -58,17 +56,6 @@ class ScanBank:
     def draw(self, key: jax.Array, views: jax.Array, sampling: PairSampling) -> Pair:
         """`draw_pairs` of these views [B] i32."""
         return draw_pairs(key, self, views, sampling)
-
-
-class Bank(Protocol):
-    """What pairs are drawn from: a pytree on the device."""
-
-    @property
-    def size(self) -> int:
-        """How many entries there are."""
-
-    def draw(self, key: jax.Array, entries: jax.Array, sampling: PairSampling) -> Pair:
-        """A batch from the entries [B] i32: sources [B, N] that share one target [M]."""
 
 
 @settings_class

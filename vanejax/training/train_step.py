@@ -18,10 +18,12 @@ from jax.flatten_util import ravel_pytree
 
 from vanejax.rigid import RigidTransform
 from vanejax.settings import Settings, not_negative, positive, settings_class
-from vanejax.training.pairs import Bank, Pair, PairSampling
+from vanejax.training.pairs import Pair, PairSampling, ScanBank
+from vanejax.training.shape_pairs import ShapeBank
 
 Metrics = dict[str, jax.Array]
 Variables = Any
+Bank = ScanBank | ShapeBank  # what pairs are drawn from
 
 
 @flax.struct.dataclass
