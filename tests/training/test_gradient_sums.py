@@ -24,7 +24,7 @@ def plain(shared, carry, xs):
         value, carry, twice = body(shared, carry, x)
         total += value
         aux.append(twice["twice"])
-    return total, carry, jnp.stack(aux)
+    return total, carry, {"twice": jnp.stack(aux)}
 
 
 @pytest.fixture
@@ -34,30 +34,20 @@ def arguments():
     return shared, jnp.ones(3), jnp.asarray(rng.normal(size=(4, 3)), jnp.float32)
 
 
-def test_values_carry_and_aux_are_those_of_the_loop(arguments):
-    total, carry, aux = jax.jit(lambda *a: sum_with_gradient(body, *a))(*arguments)
-    expected = plain(*arguments)
-    np.testing.assert_allclose(total, expected[0], atol=EXACT)
-    np.testing.assert_allclose(carry, expected[1], atol=EXACT)
-    np.testing.assert_allclose(aux["twice"], expected[2], atol=EXACT)
-
-
 def test_the_gradient_is_that_of_the_loop_in_reverse(arguments):
-    """Scaled by what comes after, and with the values on the side as they were."""
+    """Scaled by what comes after, and with the value, the carry and what stands on the side."""
+    shared, *rest = arguments
 
-    def loss(function, shared):
-        total, _, aux = function(shared, *arguments[1:])
-        return jnp.tanh(0.1 * total), aux
+    def loss(function):
+        def of(shared):
+            total, carry, aux = function(shared, *rest)
+            return jnp.tanh(0.1 * total), (carry, aux)
 
-    (value, aux), found = jax.jit(
-        jax.value_and_grad(lambda s: loss(lambda *a: sum_with_gradient(body, *a), s), has_aux=True)
-    )(arguments[0])
-    (expected, twice), gradient = jax.value_and_grad(lambda s: loss(plain, s), has_aux=True)(
-        arguments[0]
-    )
-    np.testing.assert_allclose(value, expected, atol=EXACT)
-    np.testing.assert_allclose(aux["twice"], twice, atol=EXACT)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=EXACT), found, gradient)
+        return jax.value_and_grad(of, has_aux=True)
+
+    found = jax.jit(loss(lambda *args: sum_with_gradient(body, *args)))(shared)
+    expected = loss(plain)(shared)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=EXACT), found, expected)
 
 
 def test_loops_nest_and_batch(arguments):

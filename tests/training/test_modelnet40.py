@@ -85,28 +85,24 @@ def test_halves_are_rpm_net_s_also_in_a_partial_copy(off_tree: Path):
     assert test.names == ["airplane_0003", "lamp_0003"]
 
 
-def test_headers_that_run_into_the_counts_are_read(tmp_path: Path):
-    run_in, apart = tmp_path / "in.off", tmp_path / "apart.off"
-    run_in.write_text(TETRAHEDRON)
-    apart.write_text(TETRAHEDRON.replace("OFF4", "OFF\n4"))
-    found, expected = read_off(run_in), read_off(apart)
-    assert found.sha256 == expected.sha256
-    assert len(found.mesh.faces) == 4
-    np.testing.assert_allclose(found.triangles.volume(), 1 / 6)
+STRAY = TETRAHEDRON.replace("OFF4 4 6\n", "OFF 5 4 6\n").replace("3 0 2 1", "900 0 0\n3 0 2 1")
 
 
-def test_polygons_become_triangles_of_the_same_area_and_volume(tmp_path: Path):
-    (tmp_path / "cube.off").write_text(CUBE)
-    part = read_off(tmp_path / "cube.off")
-    np.testing.assert_allclose(part.triangles.areas().sum(), 24)
-    np.testing.assert_allclose(part.triangles.volume(), 8)
-    np.testing.assert_allclose(part.center, [5, 0, 0])
-
-
-def test_vertices_that_no_face_uses_do_not_scale_the_shape(tmp_path: Path):
-    text = TETRAHEDRON.replace("OFF4 4 6\n", "OFF 5 4 6\n").replace("3 0 2 1", "900 0 0\n3 0 2 1")
-    (tmp_path / "stray.off").write_text(text)
-    assert read_off(tmp_path / "stray.off").radius < 1
+@pytest.mark.parametrize(
+    ("text", "faces", "volume", "center"),
+    [
+        (TETRAHEDRON, 4, 1 / 6, 0.5),  # its header runs into the counts
+        (TETRAHEDRON.replace("OFF4", "OFF\n4"), 4, 1 / 6, 0.5),
+        (CUBE, 12, 8, (5, 0, 0)),  # polygons become triangles
+        (STRAY, 4, 1 / 6, 0.5),  # a vertex that no face uses does not scale the shape
+    ],
+)
+def test_a_mesh_is_read_as_it_is(tmp_path: Path, text: str, faces: int, volume: float, center):
+    (tmp_path / "shape.off").write_text(text)
+    part = read_off(tmp_path / "shape.off")
+    assert len(part.mesh.faces) == faces
+    np.testing.assert_allclose(part.triangles.volume(), volume)
+    np.testing.assert_allclose(part.center, center)
 
 
 @pytest.mark.parametrize(

@@ -99,10 +99,7 @@ def test_threads_ahead_change_nothing(stream, workers):
         ahead = [np.asarray(next(banks).scans.xyz) for _ in range(3)]  # then the context is left
     for step, found in zip((2, 3, 4), ahead, strict=True):
         np.testing.assert_array_equal(found, stream.of_step(step).scans.xyz)
-
-
-def test_steps_end_where_they_should(stream):
-    with stream.steps(5, 7) as banks:
+    with stream.steps(5, 7, workers=workers) as banks:
         assert len(list(banks)) == 2
 
 

@@ -114,11 +114,8 @@ def make_scan_set(
 ) -> ScanSet:
     """Scans a part from every viewpoint and thins scans and CAD surface alike.
 
-    Args:
-      part, camera, viewpoints: what is seen, by what, from where.
-      voxel_mm: one point per voxel is kept; it must be several times the pixel spacing, so that
-        scans and CAD surface end up equally dense and X / Y is the visible share.
-      progress: whether to show a progress bar.
+    One point per voxel is kept; ``voxel_mm`` must be several times the pixel spacing, so that scans
+    and CAD surface end up equally dense and X / Y is the visible share.
 
     Raises:
       InputError: a view that does not see the part, or a voxel that leaves too few points.
@@ -171,9 +168,7 @@ def load_scan_set(
 ) -> ScanSet:
     """Reads what `ScanSet.save` wrote; nothing in the file is unpickled or trusted.
 
-    Args:
-      path: the .npz file.
-      expected: as `describe_source` gives it; the file must have been made from the same.
+    It must have been made from what is ``expected``, as `describe_source` gives it.
 
     Raises:
       InputError: no such file, not a scan set, another version, truncated, changed, or stale.

@@ -23,16 +23,10 @@ OfPair = Callable[[Any, Pair], tuple[jax.Array, dict[str, jax.Array]]]
 def sum_with_gradient(body: Body, shared: Any, carry: Any, xs: Any) -> tuple[jax.Array, Any, Any]:
     """Sums ``value`` of ``value, carry, aux = body(shared, carry, x)`` over the leading axis of xs.
 
-    As `jax.lax.scan`, but differentiable in ``shared`` alone: carry and xs count as constants.
-    The gradient of each turn is taken right after its forward pass, while what it needs is still in
-    the caches, and one turn's memory serves them all. Plain reverse mode would keep the
-    intermediate values of every turn until the last one has run.
-
-    Args:
-      body: pure; closes over no value that is differentiated.
-      shared: pytree of floating point arrays, such as the parameters.
-      carry: what a turn leaves to the next.
-      xs: pytree with a leading axis of turns.
+    As `jax.lax.scan`, but differentiable in ``shared`` alone, a pytree of floating point arrays:
+    carry, xs and what ``body`` closes over count as constants. The gradient of each turn is taken
+    right after its forward pass, while what it needs is still in the caches, and one turn's memory
+    serves them all; plain reverse mode would keep the values of every turn until the last has run.
 
     Returns:
       The sum of the values [], the last carry, and the stacked aux.
@@ -79,8 +73,8 @@ def mean_over_pairs(
       of_pair: ``value, metrics = of_pair(shared, pair)`` for one pair.
       shared: what the mean is differentiable in; see `sum_with_gradient`.
       pairs: sources and labels [B].
-      pairs_at_once: pairs of the batch that are computed side by side: 1 suits the caches of a
-        CPU, the whole batch a GPU. It should divide the batch, and changes rounding only.
+      pairs_at_once: how many are computed side by side: 1 suits the caches of a CPU, the whole
+        batch a GPU. It should divide the batch, and changes rounding only.
     """
     batch = pairs.source.mask.shape[0]
     at_once = math.gcd(batch, pairs_at_once)

@@ -19,17 +19,11 @@ from vanejax.errors import InputError
 from vanejax.training.generic_solids import unit_samples
 
 HDF5_FOLDER, OFF_FOLDER = "modelnet40_ply_hdf5_2048", "ModelNet40"
-PUBLISHED = {("HDF5", "train"): 9840, ("HDF5", "test"): 2468} | {
-    ("OFF", "train"): 9843,
-    ("OFF", "test"): 2468,
-}
-"""Shapes of each split as published, all categories."""
-
+# shapes of each split as published, all categories
+PUBLISHED = {"HDF5": {"train": 9840, "test": 2468}, "OFF": {"train": 9843, "test": 2468}}
+# in alphabetical order: RPM-Net's for training, for tests, and all
 CATEGORIES = ("first 20", "last 20", "all")
-"""Which of the categories, in alphabetical order: RPM-Net's for training, for tests, and all."""
-
 LAST_OF_FIRST_20 = "lamp"  # the next is the laptop: so the half is the same in a partial copy
-
 MAX_NUMBERS = 2**29  # of one HDF5 dataset, 4 bytes each: a compressed file may promise any size
 MAX_BYTES = 2**29  # of an OFF file; the largest published one has 36 MB
 
@@ -53,14 +47,12 @@ class ModelNet40(NamedTuple):
 def read_modelnet40(
     folder: Path, *, split: str, categories: str, seed: int, num_points: int
 ) -> ModelNet40:
-    """Reads one split of some categories.
+    """Reads one split ("train" or "test") of the categories (one of `CATEGORIES`).
 
     Args:
       folder: ``modelnet40_ply_hdf5_2048`` or ``ModelNet40`` under any name, or what holds it.
-      split: "train" or "test".
-      categories: one of `CATEGORIES`.
       seed: of the samples on OFF meshes, or of which points are taken of more than `num_points`.
-      num_points: P, of each shape; the HDF5 files hold 2048, so that P is no more than that.
+      num_points: P, of each shape; from HDF5 at most the 2048 that the files hold.
 
     Raises:
       InputError: no ModelNet40 is there, or a file cannot be used; the message says which and why.
@@ -79,7 +71,7 @@ def read_modelnet40(
         samples, names, size = found
         if not names:
             raise InputError(f"{place}: holds no {split} shapes of the {categories} categories")
-        published = PUBLISHED[layout, split]
+        published = PUBLISHED[layout][split]
         whole = "as published" if size == published else f"where {published} are published"
         title = (
             f"ModelNet40 ({layout}), {split} split, {categories} categories: {len(names)} "

@@ -24,14 +24,10 @@ from vanejax.training.train_step import Loss, Variables
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """A network to train and to register with.
+    """A network to train and to register with, by the title that tables call it.
 
-    Attributes:
-      title: as tables call it.
-      model: without parameters.
-      loss: of its training.
-      factory: ``factory(model, variables, iterations=n)`` is a `Register`.
-      iterations: of the network at inference.
+    ``factory(model, variables, iterations=n)`` is a `Register`; ``iterations`` are those at
+    inference.
     """
 
     title: str

@@ -143,19 +143,16 @@ def random_casting(rng: np.random.Generator, most_mm: float) -> InvestmentCastin
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ScanStream:
-    """Random scans of a part as training takes them.
+    """Random scans of a part as training takes them, B = ``batch_size`` in a step.
 
     Attributes:
       part: the CAD model: frame, centre and radius.
       reference: [Y] its thinned surface on the device, unit-sphere units.
       sensor: each scan is by `Sensor.sample` one of this kind.
       views: from where.
-      castings: scanners of the parts that are scanned, by turns: the CAD model's own, or castings
-        that differ from it.
-      batch_size: B, scans in a step.
+      castings: scanners of the parts that are scanned: the CAD model's own, or of castings of it.
       sampling: a scan has M X / Y points, at most N, its ``num_reference`` and ``num_source``.
       voxel_mm: thinning, as that of the reference.
-      seed: of everything.
     """
 
     part: Part

@@ -17,17 +17,14 @@ from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.training.pairs import Pair, PairSampling, draw_pose, draw_subset, jitter
 
-KEPT_SHARE = 0.7
-"""Of a cloud's points, what cropping leaves: the published share."""
+KEPT_SHARE = 0.7  # of a cloud's points, what cropping leaves: as published
 
 
 @flax.struct.dataclass
 class ShapeBank:
-    """Shapes on the device, each in a frame of its own and in unit-sphere units.
+    """Shapes on the device: points and unit normals [S, P, 3] f32.
 
-    Attributes:
-      points: [S, P, 3] f32.
-      normals: [S, P, 3] f32, unit length.
+    Each has a frame of its own, in unit-sphere units.
     """
 
     points: jax.Array
@@ -77,10 +74,9 @@ class ShapeBank:
 
 
 def crop(key: jax.Array, cloud: PointCloud, rows: int) -> PointCloud:
-    """The ``rows`` real points of a cloud [P] that lie farthest in a random direction.
+    """The ``rows`` real points of a cloud [P] on one side of a plane, in their order.
 
-    This is a cut by a plane: the direction is uniform on the sphere, the plane lies where it leaves
-    that many points. They keep their order. Padding is cut first.
+    Its direction is uniform on the sphere; it lies where it leaves that many. Padding is cut first.
     """
     direction = jax.random.normal(key, (3,))
     height = jnp.sum(cloud.xyz * direction[None, :], axis=1)

@@ -19,15 +19,11 @@ RADIUS = 1.001  # of the unit sphere once its points are rounded to float16
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ShapeSet:
-    """Shapes, each sampled in a frame of its own.
+    """Shapes, each sampled in a frame of its own: points and normals [S, P, 3] f32, names [S].
 
-    Attributes:
-      points: [S, P, 3] f32, in the unit sphere.
-      normals: [S, P, 3] f32, unit length.
-      names: [S].
-      title: what every output calls the set, in words.
-      sha256: hex digest of points and normals (little-endian) and names: the same for the same
-        training data, wherever they came from.
+    Points lie in the unit sphere, normals have unit length. ``title`` is what every output calls
+    the set; ``sha256`` is of points and normals (little-endian) and names: the same for the same
+    training data, wherever they came from.
     """
 
     points: np.ndarray

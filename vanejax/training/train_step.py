@@ -101,7 +101,7 @@ def init_state(
 
     @jax.jit
     def init(key: jax.Array) -> Variables:
-        # Only the shapes of a pair matter here: inside the jit nothing of it is computed.
+        # only the shapes of a pair matter here: inside the jit nothing of it is computed
         draw_key = jax.random.fold_in(key, 1)
         pairs = bank.draw(draw_key, jnp.zeros((1,), jnp.int32), sampling)
         source = jax.tree.map(lambda leaf: leaf[0], pairs.source)
@@ -122,13 +122,12 @@ def first_state(optimizer: optax.GradientTransformation, variables: Variables) -
 
 def views_of_step(key: jax.Array, step: jax.Array, *, batch_size: int, num_views: int) -> jax.Array:
     """View indices [batch_size] i32: each epoch visits every view once, in its own random order."""
-    position = step * batch_size + jnp.arange(batch_size)
-    epochs = position // num_views
 
-    def of(epoch: jax.Array, place: jax.Array) -> jax.Array:
+    def view(position: jax.Array) -> jax.Array:
+        epoch, place = jnp.divmod(position, num_views)
         return jax.random.permutation(jax.random.fold_in(key, epoch), num_views)[place]
 
-    return jax.vmap(of)(epochs, position % num_views)
+    return jax.vmap(view)(step * batch_size + jnp.arange(batch_size))
 
 
 def make_train_step(

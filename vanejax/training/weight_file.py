@@ -75,11 +75,8 @@ class TrainedMatcher:
       variables: its weights, numpy f32; the moving average that training kept.
       iterations: of the network at inference.
       sampling: how pairs were drawn in training: points, noise, and the poses it learned to undo.
-        A scan of X thinned points gives ``num_reference X / Y`` source points, with Y the number
-        of ``reference_points``, in ``num_source`` rows.
       voxel_mm: thinning of scan and part before points are drawn.
-      center: [3] f64, mm, part frame.
-      radius_mm: of the part.
+      center, radius_mm: of the part: [3] f64, mm, part frame.
       reference_points: [Y, 3] f32, mm, part frame: its surface, thinned.
       reference_normals: [Y, 3] f32, unit, outward.
       part_name, part_sha256: the part it was trained for.
@@ -216,10 +213,8 @@ def model_from_dict(values: Any, where: str) -> RpmNet:
       InputError: a setting is missing, unknown or cannot be; the message starts with ``where``.
     """
     settings = _checked(values, _MODEL, f"{where}: model")
-    if settings["feature_width"] % 8:
-        raise InputError(
-            f"{where}: model: feature_width={settings['feature_width']} is no multiple of 8"
-        )
+    if (width := settings["feature_width"]) % 8:
+        raise InputError(f"{where}: model: feature_width={width} is no multiple of 8")
     return RpmNet(**settings)
 
 
@@ -272,10 +267,9 @@ def _variables(model: RpmNet, arrays: Mapping[str, np.ndarray], where: str) -> A
         raise InputError(f"{where}: not the arrays of this network; {', '.join(listed)}")
     for name, value in arrays.items():
         shape = expected[name].shape if name in expected else value.shape
-        dtype = np.dtype(np.float32)
-        if value.shape != shape or value.dtype != dtype:
+        if value.shape != shape or value.dtype != np.float32:
             raise InputError(
-                f"{where}: {name} is {value.dtype} {value.shape}, the network's is {dtype} {shape}"
+                f"{where}: {name} is {value.dtype} {value.shape}, the network's is float32 {shape}"
             )
         if not np.isfinite(value).all():
             raise InputError(f"{where}: {name} holds values that are not finite")
