@@ -114,10 +114,9 @@ def measure(
     scan = scanner.scan(sensor.camera, camera_from_part)
     view = SensedView(scanner, scan, sensor, rng)
     reason = np.zeros(len(scan.points), np.uint8)
-    for why, dropout in DROPOUTS:
-        dropped = dropout(view)
-        if dropped is not None:
-            reason[dropped & (reason == Reason.MEASURED)] = why
+    for why, dropout, field in DROPOUTS:
+        if getattr(sensor, field):
+            reason[dropout(view) & (reason == Reason.MEASURED)] = why
     kept = np.flatnonzero(reason == Reason.MEASURED)
     points = _points_with_errors(view, kept)
     depth = -points[:, 2]
@@ -131,30 +130,28 @@ def _points_with_errors(view: SensedView, kept: np.ndarray) -> np.ndarray:
     points = view.scan.points.take(kept, axis=0)
     true_depth = -points[:, 2]
     depth = _triangulated(view, kept, true_depth)
-    for change in DEPTH_CHANGES:
-        changed = change(view, kept, depth)
-        depth = depth if changed is None else changed
+    for change in view.active(DEPTH_CHANGES):
+        depth = change(view, kept, depth)
     if depth is not true_depth:
         points *= (depth / true_depth)[:, None]
-    for change in POINT_CHANGES:
-        changed = change(view, points, depth)
-        points = points if changed is None else changed
+    for change in view.active(POINT_CHANGES):
+        points = change(view, points, depth)
     return points
 
 
 def _triangulated(view: SensedView, kept: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Depths [n] f32 mm from disparities with their errors; the same array where there are none."""
-    focal_baseline = view.sensor.focal_baseline
-    disparity = np.float32(focal_baseline) / depth
-    exact = disparity
-    # the first that is drawn is added last: recorded scans hold this order of rounding
-    for error in [effect(view, kept) for effect in DISPARITY_ERRORS][::-1]:
-        disparity = disparity if error is None else disparity + error
-    for change in DISPARITY_CHANGES:
-        changed = change(view, kept, disparity)
-        disparity = disparity if changed is None else changed
-    if disparity is exact:
+    errors = [error(view, kept) for error in view.active(DISPARITY_ERRORS)]
+    changes = view.active(DISPARITY_CHANGES)
+    if not (errors or changes):
         return depth
+    focal_baseline = np.float32(view.sensor.focal_baseline)
+    disparity = focal_baseline / depth
+    # the first that is drawn is added last: recorded scans hold this order of rounding
+    for error in reversed(errors):
+        disparity = disparity + error
+    for change in changes:
+        disparity = change(view, kept, disparity)
     # no depth is measured beyond the far plane, and none from a disparity that is not positive
-    least = np.float32(focal_baseline / (2 * view.sensor.camera.far_mm))
-    return np.float32(focal_baseline) / np.maximum(disparity, least)
+    least = np.float32(view.sensor.focal_baseline / (2 * view.sensor.camera.far_mm))
+    return focal_baseline / np.maximum(disparity, least)

@@ -1,8 +1,8 @@
 """The effects of a sensor, one function each, and the order in which a scan goes through them.
 
-A new effect is a function here and its place in one of the tables at the end of the file; its
-magnitude is a field of `vanejax.scanner.sensor.Sensor`, and its mathematics, where it is long,
-stands in `exposure` or `range_errors`. An effect that is switched off returns None: it draws no
+A new effect is a function here and its place in one of the tables at the end of the file, with the
+fields of `vanejax.scanner.sensor.Sensor` that switch it on; its mathematics, where it is long,
+stands in `exposure` or `range_errors`. An effect that is switched off is not called: it draws no
 random number and changes no bit. Effects draw in the order of the tables.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import functools
+from collections.abc import Callable
 
 import numpy as np
 
@@ -55,6 +56,12 @@ class SensedView:
     sensor: Sensor
     rng: np.random.Generator
 
+    def active(self, effects: tuple[tuple, ...]) -> list[Callable[..., np.ndarray]]:
+        """Those of a table that the sensor has switched on."""
+        return [
+            effect for effect, *fields in effects if any(getattr(self.sensor, f) for f in fields)
+        ]
+
     def rows_columns(self, which: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, ...]:
         """Rows and columns [n] i32 of the pixels, or of the indices ``which``."""
         return np.divmod(self.scan.pixel[which], np.int32(self.sensor.camera.width))
@@ -90,19 +97,17 @@ class SensedView:
 # Dropouts: which of the N pixels measure nothing, [N] bool.
 
 
-def projector_shadow(view: SensedView) -> np.ndarray | None:
+def projector_shadow(view: SensedView) -> np.ndarray:
     """What the projector does not light."""
-    if not view.sensor.shadow:
-        return None
     scan = view.scan
     return ~view.scanner.lit(scan.points, scan.normals, view.to_projector, scan.camera_from_part)
 
 
-def grazing_incidence(view: SensedView) -> np.ndarray | None:
+def grazing_incidence(view: SensedView) -> np.ndarray:
     """What is seen flatter than a limit, which may vary from place to place."""
     sensor, points = view.sensor, view.scan.points
     if sensor.max_incidence_deg >= 90:
-        return None
+        return np.zeros(len(points), bool)
     inverse = 1 / np.sqrt(np.einsum("ni,ni->n", points, points))
     cosine = -np.einsum("ni,ni->n", points, view.scan.normals) * inverse
     if not sensor.incidence_spread_deg:
@@ -111,28 +116,23 @@ def grazing_incidence(view: SensedView) -> np.ndarray | None:
     return cosine < np.cos(np.radians(np.clip(limit_deg, 0, 90)))
 
 
-def saturation(view: SensedView) -> np.ndarray | None:
+def saturation(view: SensedView) -> np.ndarray:
     """Where the brightest fringe fills the pixel's well."""
-    return None if view.sensor.exposure is None else view.brightness[1] >= 1
+    return view.brightness[1] >= 1
 
 
-def darkness(view: SensedView) -> np.ndarray | None:
+def darkness(view: SensedView) -> np.ndarray:
     """Where the fringes are too weak."""
-    exposure = view.sensor.exposure
-    return None if exposure is None else view.brightness[0] < exposure.least_modulation
+    return view.brightness[0] < view.sensor.exposure.least_modulation
 
 
-def pixel_dropout(view: SensedView) -> np.ndarray | None:
+def pixel_dropout(view: SensedView) -> np.ndarray:
     """Pixels that are lost singly."""
-    if not view.sensor.dropout_rate:
-        return None
     return view.rng.random(len(view.scan.pixel), dtype=np.float32) < view.sensor.dropout_rate
 
 
-def border_dropout(view: SensedView) -> np.ndarray | None:
+def border_dropout(view: SensedView) -> np.ndarray:
     """A strip along the outline, where the window holds too much of what is not the part."""
-    if not view.sensor.border_dropout_px:
-        return None
     width_px = view.sensor.border_dropout_px * (1 + view.random_field())
     return near_outline(*view.rows_columns(), width_px)
 
@@ -140,25 +140,22 @@ def border_dropout(view: SensedView) -> np.ndarray | None:
 # Errors of the disparity of the n pixels ``kept``, [n] f32, pixels.
 
 
-def range_noise(view: SensedView, kept: np.ndarray) -> np.ndarray | None:
+def range_noise(view: SensedView, kept: np.ndarray) -> np.ndarray:
     """White noise, which grows where less light comes back, and noise smooth in the image."""
-    sensor, error = view.sensor, None
+    sensor, error = view.sensor, np.float32(0)
     if sensor.noise_px:
         white = view.rng.standard_normal(len(kept), dtype=np.float32)
         error = np.float32(sensor.noise_px) * white
         if sensor.exposure is not None:
             error *= sensor.exposure.noise_gain(*view.brightness).take(kept)
     if sensor.correlated_px:
-        smooth = view.random_field(kept) * np.float32(sensor.correlated_px)
-        error = smooth if error is None else error + smooth
+        error = error + view.random_field(kept) * np.float32(sensor.correlated_px)
     return error
 
 
-def matching_window(view: SensedView, kept: np.ndarray) -> np.ndarray | None:
+def matching_window(view: SensedView, kept: np.ndarray) -> np.ndarray:
     """A window matched as one: rounded edges, and edge fattening where its texture lies aside."""
     sensor = view.sensor
-    if not (sensor.window_px or sensor.edge_fattening_px):
-        return None
     row, column = view.rows_columns()
     depth = -view.scan.points[:, 2]
     true = np.float32(sensor.focal_baseline) / depth
@@ -174,11 +171,9 @@ def matching_window(view: SensedView, kept: np.ndarray) -> np.ndarray | None:
 # Changes of the measured disparity [n] f32, pixels, of the pixels ``kept``.
 
 
-def flying_pixels(view: SensedView, kept: np.ndarray, disparity: np.ndarray) -> np.ndarray | None:
+def flying_pixels(view: SensedView, kept: np.ndarray, disparity: np.ndarray) -> np.ndarray:
     """Pixels at depth edges that see some of both surfaces."""
     sensor = view.sensor
-    if not sensor.flying_pixel_rate:
-        return None
     pixel, depth = view.scan.pixel.take(kept), -view.scan.points[kept, 2]
     sides = depth_jumps(pixel, depth, width=sensor.camera.width, jump_mm=sensor.jump_mm)
     mixed, error = flying_pixel_errors(view.rng, sides, disparity, rate=sensor.flying_pixel_rate)
@@ -187,9 +182,7 @@ def flying_pixels(view: SensedView, kept: np.ndarray, disparity: np.ndarray) -> 
     return disparity
 
 
-def disparity_quantisation(
-    view: SensedView, kept: np.ndarray, disparity: np.ndarray
-) -> np.ndarray | None:
+def disparity_quantisation(view: SensedView, kept: np.ndarray, disparity: np.ndarray) -> np.ndarray:
     """Disparities in whole steps."""
     return _quantised(disparity, view.sensor.disparity_quantisation_px)
 
@@ -197,22 +190,18 @@ def disparity_quantisation(
 # Changes of the measured depth [n] f32, mm, of the pixels ``kept``.
 
 
-def trueness(view: SensedView, kept: np.ndarray, depth: np.ndarray) -> np.ndarray | None:
+def trueness(view: SensedView, kept: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """What calibration leaves of the depth: the same in every scan."""
     sensor = view.sensor
-    if sensor.trueness is None:
-        return None
     row, column = view.rows_columns(kept)
     x = (column + np.float32(0.5)) / np.float32(sensor.camera.width / 2) - 1
     y = (row + np.float32(0.5)) / np.float32(sensor.camera.height / 2) - 1
     return depth + sensor.trueness.error_mm(depth, x, y).astype(np.float32)
 
 
-def outliers(view: SensedView, kept: np.ndarray, depth: np.ndarray) -> np.ndarray | None:
+def outliers(view: SensedView, kept: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Points that lie anywhere near."""
     sensor, rng = view.sensor, view.rng
-    if not sensor.outlier_rate:
-        return None
     wrong = np.flatnonzero(rng.random(len(kept), dtype=np.float32) < sensor.outlier_rate)
     depth = depth.copy()
     side = 2 * rng.random(len(wrong), dtype=np.float32) - 1
@@ -220,23 +209,21 @@ def outliers(view: SensedView, kept: np.ndarray, depth: np.ndarray) -> np.ndarra
     return depth
 
 
-def depth_quantisation(view: SensedView, kept: np.ndarray, depth: np.ndarray) -> np.ndarray | None:
+def depth_quantisation(view: SensedView, kept: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Depths in whole steps."""
     return _quantised(depth, view.sensor.depth_quantisation_mm)
 
 
-def _quantised(values: np.ndarray, step: float) -> np.ndarray | None:
-    return np.float32(step) * np.round(values / np.float32(step)) if step else None
+def _quantised(values: np.ndarray, step: float) -> np.ndarray:
+    return np.float32(step) * np.round(values / np.float32(step))
 
 
 # Moves of the measured points across the ray.
 
 
-def lens_distortion(view: SensedView, points: np.ndarray, depth: np.ndarray) -> np.ndarray | None:
+def lens_distortion(view: SensedView, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """[n, 3] f32 mm: what calibration leaves of the lens, for points at depths [n]."""
     sensor = view.sensor
-    if sensor.lens is None:
-        return None
     x, y = points[:, 0] / depth, points[:, 1] / depth
     shifts = sensor.lens.shifts(x, y, fx=sensor.camera.fx, fy=sensor.camera.fy)
     points = points.copy()
@@ -245,15 +232,26 @@ def lens_distortion(view: SensedView, points: np.ndarray, depth: np.ndarray) -> 
     return points
 
 
+# Each with the fields of the sensor of which one, at least, must be set.
 DROPOUTS = (
-    (Reason.SHADOWED, projector_shadow),
-    (Reason.GRAZING, grazing_incidence),
-    (Reason.SATURATED, saturation),
-    (Reason.DARK, darkness),
-    (Reason.LOST, pixel_dropout),
-    (Reason.LOST, border_dropout),
+    (Reason.SHADOWED, projector_shadow, "shadow"),
+    (Reason.GRAZING, grazing_incidence, "max_incidence_deg"),
+    (Reason.SATURATED, saturation, "exposure"),
+    (Reason.DARK, darkness, "exposure"),
+    (Reason.LOST, pixel_dropout, "dropout_rate"),
+    (Reason.LOST, border_dropout, "border_dropout_px"),
 )
-DISPARITY_ERRORS = (range_noise, matching_window)
-DISPARITY_CHANGES = (flying_pixels, disparity_quantisation)
-DEPTH_CHANGES = (trueness, outliers, depth_quantisation)
-POINT_CHANGES = (lens_distortion,)
+DISPARITY_ERRORS = (
+    (range_noise, "noise_px", "correlated_px"),
+    (matching_window, "window_px", "edge_fattening_px"),
+)
+DISPARITY_CHANGES = (
+    (flying_pixels, "flying_pixel_rate"),
+    (disparity_quantisation, "disparity_quantisation_px"),
+)
+DEPTH_CHANGES = (
+    (trueness, "trueness"),
+    (outliers, "outlier_rate"),
+    (depth_quantisation, "depth_quantisation_mm"),
+)
+POINT_CHANGES = ((lens_distortion, "lens"),)
