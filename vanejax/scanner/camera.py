@@ -42,8 +42,7 @@ class Camera:
       fov_x_deg, fov_y_deg: full horizontal and vertical opening angles.
       near_mm, far_mm: clip planes, as depths along the optical axis (PCL's clip distances).
 
-    Raises:
-      InputError: a value that no camera can have.
+    A value that no camera can have raises InputError.
     """
 
     width: int = 1280
@@ -152,15 +151,9 @@ def look_at(position: np.ndarray, target: np.ndarray) -> RigidTransform:
     says and the equations do not. The up vector ``u0 = (0, 1, 0)`` gives no R for a camera along
     the part's y axis: there R is +x.
 
-    Args:
-      position: [..., 3] mm, part frame.
-      target: [3] or [..., 3] mm, part frame.
-
-    Returns:
-      Rotation [..., 3, 3] and translation [..., 3], float64. It maps ``target`` to (0, 0, -r).
-
-    Raises:
-      InputError: non-finite coordinates, or a camera at its target.
+    Positions are [..., 3], targets [3] or [..., 3], mm, part frame; the result, rotations
+    [..., 3, 3] and translations [..., 3] f64, maps ``target`` to (0, 0, -r). Non-finite
+    coordinates, or a camera at its target, raise InputError.
     """
     position, target = np.asarray(position, np.float64), np.asarray(target, np.float64)
     if position.shape[-1:] != (3,) or target.shape[-1:] != (3,):
@@ -213,19 +206,13 @@ class Viewpoints:
         turns = self.azimuth_deg / TEST_AZIMUTH_STEP_DEG
         return np.abs(turns - np.round(turns)) < 1e-9
 
-    def view(self, index: int) -> RigidTransform:
-        """camera_from_part of one view: rotation [3, 3], translation [3]."""
-        poses = self.camera_from_part
-        return RigidTransform(poses.rotation[index], poses.translation[index])
+    def view(self, index: int | np.ndarray) -> RigidTransform:
+        """camera_from_part of one view: rotation [3, 3], translation [3]; or of several."""
+        return RigidTransform(*(values[index] for values in self.camera_from_part))
 
     def select(self, which: np.ndarray) -> Viewpoints:
         """The views at the indices, slice or [V] bool mask ``which``, in that order."""
-        poses = self.camera_from_part
-        return Viewpoints(
-            elevation_deg=self.elevation_deg[which],
-            azimuth_deg=self.azimuth_deg[which],
-            camera_from_part=RigidTransform(poses.rotation[which], poses.translation[which]),
-        )
+        return Viewpoints(self.elevation_deg[which], self.azimuth_deg[which], self.view(which))
 
 
 def hemisphere_viewpoints(
@@ -238,19 +225,11 @@ def hemisphere_viewpoints(
 ) -> Viewpoints:
     """The viewpoints of Algorithm 1, elevation in the outer loop: 6 x 36 = 216 by default.
 
-    ``"sphere"`` is what the text means, a hemisphere about the part's centre:
-    ``r (cos a cos b, cos a sin b, sin a)``. ``"printed"`` is what the algorithm prints,
-    ``r (sin a cos b, cos a sin b, sin a)``: no sphere, 490 to 563 mm away at azimuth 0.
-
-    Args:
-      center: [3] mm, part frame: what the cameras look at (the middle of the CAD part).
-      distance_mm: r.
-      elevations_deg: a; from -90 to 90.
-      azimuths_deg: b.
-      formula: one of `FORMULAS`.
-
-    Raises:
-      InputError: values that give no viewpoint.
+    The cameras look at ``center`` [3] mm, part frame, from r = ``distance_mm`` away, at elevations
+    a from -90 to 90 and azimuths b. ``"sphere"`` is what the text means, a hemisphere about the
+    part's centre: ``r (cos a cos b, cos a sin b, sin a)``. ``"printed"`` is what the algorithm
+    prints, ``r (sin a cos b, cos a sin b, sin a)``: no sphere, 490 to 563 mm away at azimuth 0.
+    Values that give no viewpoint raise InputError.
     """
     center = np.asarray(center, np.float64)
     if center.shape != (3,) or not np.isfinite(center).all():

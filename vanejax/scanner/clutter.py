@@ -78,8 +78,7 @@ class Clutter:
       chips: number of chips on the part, the table and the jaws.
       drops: number of drops of coolant there.
 
-    Raises:
-      InputError: a number that is negative.
+    A number that is negative raises InputError.
     """
 
     table: bool = False
@@ -118,17 +117,10 @@ def table(
     tilt_deg: float = 0.0,
     azimuth_deg: float = 0.0,
 ) -> ClutterObject:
-    """A square plate under the part, which touches it at the part's lowest point.
+    """A square plate under the part, which stands in its middle and touches it at its lowest point.
 
-    Args:
-      part: what stands on it.
-      size_mm: side of the square, the part in its middle.
-      thickness_mm: of the plate.
-      tilt_deg: of its normal against +z.
-      azimuth_deg: towards which its normal is tilted, from +x about +z.
-
-    Raises:
-      InputError: a plate without size, or tilted by 90 deg or more.
+    Its normal is tilted by ``tilt_deg`` against +z, towards ``azimuth_deg`` from +x about +z. A
+    plate without size, or tilted by 90 deg or more, raises InputError.
     """
     if not (0 < size_mm < math.inf and 0 < thickness_mm < math.inf and 0 <= tilt_deg < 90):
         raise InputError(

@@ -39,8 +39,7 @@ class Exposure:
       reference_signal: brightness at which `Sensor.noise_px` holds; shot noise grows as the
         square root of all light, and what is measured is the modulation.
 
-    Raises:
-      InputError: a value that no light can have.
+    A value that no light can have raises InputError.
     """
 
     exposure_ms: float = 10.0
@@ -73,11 +72,8 @@ class Exposure:
         """[N] f32, brightness per unit of light from a direction, relative to the reference.
 
         ``(1 - specular) cos_l + specular exp(-(tan h / m)^2) / (4 m^2 cos(h)^4 cos_v)`` with the
-        angle h between the normal and the middle of both ways, and m the roughness.
-
-        Args:
-          normals, to_camera: [N, 3] f32, unit.
-          to_light: [N, 3] or [3] f32, unit.
+        angle h between the normal and the middle of both ways, and m the roughness. All directions
+        are [N, 3] f32, unit; the light's may be [3].
         """
         to_light = np.broadcast_to(to_light, normals.shape)
         cosine = np.maximum(_dot(normals, to_light), 0)

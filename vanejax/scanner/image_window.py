@@ -62,10 +62,8 @@ class PartEnvelope:
     def around(cls, vertices: np.ndarray) -> PartEnvelope:
         """What `SIDES` planes that look in all directions leave of space when moved up to a part.
 
-        Not the convex hull: that may have a corner for every vertex, and fails on a flat part.
-
-        Args:
-          vertices: [V, 3] f64, mm, not all the same.
+        Not the convex hull: that may have a corner for every vertex, and fails on a flat part. The
+        vertices, [V, 3] f64, mm, must not all be the same.
         """
         outward = _directions(SIDES)
         inside = vertices.mean(axis=0)
@@ -87,13 +85,8 @@ class PartEnvelope:
     ) -> list[Window]:
         """Windows from top to bottom that hold every pixel whose ray may meet the part.
 
-        Each is as wide as the envelope's image is in its rows. An envelope that reaches behind the
-        camera has no bounded image: every pixel then.
-
-        Args:
-          camera: intrinsics.
-          camera_from_part: rotation [3, 3], translation [3] mm; part is the corners' frame.
-          pixels: of a window, about; at least one row.
+        Each has about ``pixels``, at least one row, and is as wide as the envelope's image is in
+        its rows. An envelope that reaches behind the camera has no bounded image: every pixel then.
         """
         corners = camera_from_part.apply(self.corners)
         if (corners[:, 2] >= 0).any():
@@ -115,13 +108,9 @@ class PartEnvelope:
     def _spans(
         self, column: np.ndarray, row: np.ndarray, tops: np.ndarray, height: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest column of the envelope's image in each band of rows; f64.
+        """Least and greatest column [S] f64 of the corners' image in bands that begin at ``tops``.
 
-        Its image is convex, so they are at a corner within the band, or where an edge leaves it.
-
-        Args:
-          column, row: [P] f64, the corners' continuous pixel coordinates.
-          tops: [S] i64, where the bands begin; each is ``height`` rows high.
+        It is convex, so they are at a corner [P] within the band, or where an edge leaves it.
         """
         borders = np.append(tops, tops[-1:] + height)
         (u0, u1), (v0, v1) = column[self.edges].T, row[self.edges].T

@@ -106,10 +106,7 @@ def measure(
 ) -> Measurement:
     """One scan of the part by a sensor: `Scanner.scan`, then what the sensor makes of it.
 
-    The same state of ``rng`` gives the same bits.
-
-    Raises:
-      InputError: no pixel sees the part.
+    The same state of ``rng`` gives the same bits. InputError if no pixel sees the part.
     """
     scan = scanner.scan(sensor.camera, camera_from_part)
     view = SensedView(scanner, scan, sensor, rng)

@@ -21,7 +21,7 @@ from vanejax.scanner.image_window import Window
 # which along the ray would be 0.01 mm and more. No sensor measures them either.
 EDGE_ON_COSINE = 1e-3
 # few enough that BLAS does not start threads, which would wait for those that scan
-PLANES_AT_ONCE = 1 << 14
+ROWS_AT_ONCE = 1 << 14
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -92,27 +92,18 @@ class PixelRays:
         turn = np.eye(4)
         turn[:3, :3] = rotation.T
         turn[:3, 3] = rotation.T @ translation
-        turned = np.empty_like(planes)
-        for first in range(0, len(planes), PLANES_AT_ONCE):
-            block = slice(first, first + PLANES_AT_ONCE)
-            np.matmul(planes[block], turn, out=turned[block])
+        facing = turned(planes, turn)
         if self.backs:
-            turned *= -np.sign(turned[:, 3:])
-        return turned
+            facing *= -np.sign(facing[:, 3:])
+        return facing
 
     def depth(
         self, x: np.ndarray, y: np.ndarray, planes: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """How deep rays meet a plane each, and where that is measured.
+        """How deep rays (x, y) [N] meet planes [N, 4] of `facing`, and where that is measured.
 
-        That is between the clip planes, unless the plane is seen edge-on or from its back.
-
-        Args:
-          x, y: [N] f64, of the rays.
-          planes: [N, 4] f64, from `facing`.
-
-        Returns:
-          [N] f64, mm, not finite where nothing is met; and [N] bool.
+        The depths, [N] f64, mm, are not finite where nothing is met. Measured, [N] bool, is what
+        lies between the clip planes, unless the plane is seen edge-on or from its back.
         """
         normal_x, normal_y, normal_z, plane = planes.T
         closing = normal_x * x
@@ -181,6 +172,15 @@ class MeasuredPixels:
         for column in (self.points, self.normals, self.face, self.pixel):
             # unchecked, since a debugger's references would count; no array looks into this one
             column.resize((self._count, *column.shape[1:]), refcheck=False)
+
+
+def turned(rows: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Rows [N, D] times ``turn`` [D, D], in blocks."""
+    out = np.empty_like(rows)
+    for first in range(0, len(rows), ROWS_AT_ONCE):
+        block = slice(first, first + ROWS_AT_ONCE)
+        np.matmul(rows[block], turn, out=out[block])
+    return out
 
 
 def _shares(across: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -78,10 +78,8 @@ def smooth_field(
     """A Gaussian random field [N] f32 at pixels [N]: mean 0, variance 1 at every one of them.
 
     White noise on a grid of ``length_px``, interpolated by cubic B-splines of unit square sum:
-    pixels ``length_px`` apart correlate by 0.49 on average, twice as far apart by 0.05.
-
-    Raises:
-      InputError: a length below one pixel.
+    pixels ``length_px`` apart correlate by 0.49 on average, twice as far apart by 0.05. A length
+    below one pixel raises InputError.
     """
     if not 1 <= length_px < math.inf:
         raise InputError(f"a correlation length must be 1 pixel or more, got {length_px!r}")
@@ -116,16 +114,11 @@ def window_mean(
     window_px: float,
     offset_px: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The mean disparity around each pixel [N] f32, among the pixels given.
+    """The mean disparity around each of the pixels [N] f32 that see the part; others do not count.
 
     Stereo compares windows, not pixels: it finds the mean disparity of the texture in a window,
-    which rounds edges off, and which may lie beside the pixel (edge fattening).
-
-    Args:
-      row, column: [N] i32, of the pixels that see the part; others do not count.
-      disparity: [N] f32.
-      window_px: standard deviation of the Gaussian window.
-      offset_px: [2, N], rows and columns from the pixel to the middle of its window.
+    which rounds edges off, and which may lie ``offset_px`` [2, N] rows and columns beside the pixel
+    (edge fattening). The window is a Gaussian of the standard deviation ``window_px``.
     """
     if not len(row):
         return disparity
@@ -162,16 +155,10 @@ def near_outline(row: np.ndarray, column: np.ndarray, width_px: np.ndarray) -> n
 def depth_jumps(
     pixel: np.ndarray, depth: np.ndarray, *, width: int, jump_mm: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Neighbouring pixels between which the depth jumps.
+    """Neighbours between which the depth [N] f32 mm jumps by ``jump_mm`` or more.
 
-    Args:
-      pixel: [N] i32, ascending, ``row * width + column``.
-      depth: [N] f32 mm.
-      width: of the image.
-      jump_mm: differences from this on are jumps.
-
-    Returns:
-      indices into the N pixels, [J] each, of the two sides.
+    Of pixels [N] i32, ascending, ``row * width + column``; the result is the indices, [J] each, of
+    the two sides.
     """
     if not len(pixel):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -198,13 +185,8 @@ def flying_pixel_errors(
     """What pixels at depth edges measure of the surface beside their own.
 
     A pixel that an edge crosses sees both sides, and its own for the larger part: the other's
-    weight is uniform up to one half.
-
-    Args:
-      rng: of what is drawn.
-      sides: [J] each, from `depth_jumps`.
-      disparity: [N] pixels.
-      rate: share of the edges at which a pixel is mixed.
+    weight is uniform up to one half. ``rate`` is the share of the edges, those of `depth_jumps`, at
+    which a pixel is mixed.
 
     Returns:
       indices of the mixed pixels [m], no two alike, and what is added to their disparity [m].

@@ -53,8 +53,7 @@ class Sensor:
       outlier_rate: of the measured points, those that lie anywhere within ``outlier_mm`` of depth.
       outlier_mm: largest error of an outlier.
 
-    Raises:
-      InputError: a value that no sensor can have.
+    A value that no sensor can have raises InputError.
     """
 
     camera: Camera = dataclasses.field(default_factory=Camera)
@@ -238,11 +237,7 @@ PRESETS = {"ideal": Sensor, "paper_camera": paper_camera, "consumer_depth": cons
 
 
 def preset(name: str) -> Sensor:
-    """The sensor of a name in `PRESETS`.
-
-    Raises:
-      InputError: there is none.
-    """
+    """The sensor of a name in `PRESETS`; InputError if there is none."""
     if name not in PRESETS:
         raise InputError(f"no sensor {name!r}; there are {', '.join(PRESETS)}")
     return PRESETS[name]()

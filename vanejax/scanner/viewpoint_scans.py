@@ -34,19 +34,14 @@ def scan_views(
     applied to each scan in the thread that made it, and only its result is kept.
 
     Args:
-      part: what is seen.
-      camera: by what.
-      viewpoints: from where; V views.
+      part, camera, viewpoints: what is seen, by what, and from where.
       transform: from `Scan` to what is kept of it, such as a thinned cloud; runs in threads.
       hidden: whether `Scan.hidden` is wanted.
       workers: number of threads; None for one per core. Does not change the result.
       progress: whether to show a progress bar.
 
-    Returns:
-      V results in the order of the viewpoints.
-
-    Raises:
-      InputError: a view that does not see the part; the message names the view.
+    The results are in the order of the viewpoints. A view that does not see the part raises
+    InputError that names it.
     """
     if workers is not None and workers < 1:
         raise InputError(f"workers must be at least 1, got {workers}")

@@ -19,7 +19,7 @@ from vanejax.scanner.camera import Camera
 from vanejax.scanner.embree_scene import EmbreeScene
 from vanejax.scanner.ideal_scan import Hits, Scan
 from vanejax.scanner.image_window import PartEnvelope, Window
-from vanejax.scanner.pixel_rays import EDGE_ON_COSINE, MeasuredPixels, PixelRays
+from vanejax.scanner.pixel_rays import EDGE_ON_COSINE, MeasuredPixels, PixelRays, turned
 
 RAYS_PER_STRIP = 24 * 1024  # what is computed of this many rays stays in the cache
 FACES_AT_ONCE = 1 << 14
@@ -59,14 +59,8 @@ class Scanner:
 
         A ray that first meets the back of a face misses: it started inside the solid, or slipped in
         at a vertex, which Embree's robust mode prevents at edges only. Open surfaces are seen from
-        both sides.
-
-        Args:
-          origins: [N, 3] mm, part frame.
-          directions: [N, 3], part frame, any length but zero.
-
-        Raises:
-          InputError: shapes that do not match, or a direction that is zero or not finite.
+        both sides. Origins, mm, and directions, of any length, are [N, 3] in the part's frame;
+        other shapes, and a direction that is zero or not finite, raise InputError.
         """
         origins = np.asarray(origins, np.float64)
         directions = np.asarray(directions, np.float64)
@@ -80,14 +74,9 @@ class Scanner:
         return self.cast_unit(origins - self._center, directions / length)
 
     def cast_unit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
-        """`cast` without its checks, for the inner loop of a registration.
+        """`cast` without its checks, for the inner loop of a registration; [...] in place of [N].
 
-        Args:
-          origins: [..., 3] f64 mm, about the part's centre; broadcast against ``directions``.
-          directions: [..., 3] f64, unit.
-
-        Returns:
-          Hits with [...] in place of [N].
+        Origins [..., 3] f64 mm, about the part's centre, broadcast against unit directions.
         """
         # jump to just before the part's bounding sphere, where float32 is finest
         skip = -np.einsum("...i,...i->...", origins, directions) - 1.01 * self._radius
@@ -113,18 +102,11 @@ class Scanner:
     def scan(
         self, camera: Camera, camera_from_part: RigidTransform, *, hidden: bool = False
     ) -> Scan:
-        """One view of the part.
+        """One view of the part from a pose of `Viewpoints.view`; ``hidden`` for `Scan.hidden`.
 
         The clip planes work as a renderer's do (the paper renders with PCL): what lies before the
         near plane is cut away, and what stood behind it is seen, if need be from its inside.
-
-        Args:
-          camera: intrinsics.
-          camera_from_part: rotation [3, 3] and translation [3] mm, as in `Viewpoints.view`.
-          hidden: whether to compute `Scan.hidden` as well.
-
-        Raises:
-          InputError: no pixel sees the part (the message says why), or the camera stands inside it.
+        InputError if no pixel sees the part (it says why), or the camera stands inside the part.
         """
         rotation = np.asarray(camera_from_part.rotation, np.float64)
         translation = np.asarray(camera_from_part.translation, np.float64)
@@ -231,16 +213,10 @@ class Scanner:
         towards: np.ndarray,
         camera_from_part: RigidTransform,
     ) -> np.ndarray:
-        """Whether light reaches points on the surface.
+        """[N] bool, whether light reaches the points and normals [N, 3] f32 of a `Scan`.
 
-        Args:
-          points, normals: [N, 3] f32, camera frame, mm and unit, as a `Scan` has them.
-          towards: [N, 3] f32 mm, or [3] for parallel light, camera frame: from each point to the
-            light. What stands in between shades the point, on its own face too.
-          camera_from_part: of the scan.
-
-        Returns:
-          [N] bool.
+        It lies ``towards`` [N, 3] f32 mm from each point, or [3] for parallel light, camera frame.
+        What stands in between shades the point, on its own face too.
         """
         rotation = np.asarray(camera_from_part.rotation, np.float64)
         center = camera_from_part.apply(self._center[None])
@@ -250,9 +226,9 @@ class Scanner:
         starts += np.float32(LIFT * self._radius) * normals.take(facing, axis=0)
         ways = towards.take(facing, axis=0) if towards.ndim == 2 else towards[None]
         turn = rotation.astype(np.float32)
-        ways = np.broadcast_to(_turned(ways, turn), starts.shape)
+        ways = np.broadcast_to(turned(ways, turn), starts.shape)
         lit[facing] = ~self._scene.is_blocked(
-            _turned(starts, turn), np.ascontiguousarray(ways), np.ones(len(facing))
+            turned(starts, turn), np.ascontiguousarray(ways), np.ones(len(facing))
         )
         return lit
 
@@ -276,15 +252,6 @@ class Scanner:
                 f"the camera at {np.round(eye + self._center, 3)} mm (part frame) is inside the "
                 f"part {self.part.name}; move it at least camera.near_mm away"
             )
-
-
-def _turned(vectors: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Rows [N, 3] times ``turn`` [3, 3], by blocks for which BLAS starts no threads."""
-    turned = np.empty_like(vectors)
-    for first in range(0, len(vectors), FACES_AT_ONCE):
-        block = slice(first, first + FACES_AT_ONCE)
-        np.matmul(vectors[block], turn, out=turned[block])
-    return turned
 
 
 def _planes_of(corners: np.ndarray) -> np.ndarray:
