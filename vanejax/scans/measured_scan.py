@@ -72,18 +72,15 @@ def clean_scan(
     missing pixels so); all but the first of equal points; points with a normal that is zero or not
     finite, or all normals where more than 1 % are.
 
-    ``sensor_origin="auto"`` takes the scan's origin, or `stated_origin`, for the sensor's place if
-    the cloud looks like a single view from there; see `why_not_from`.
+    Arrays of other shapes, fewer than 50 distinct points, and points on one line raise InputError.
 
     Args:
       points: [N, 3] float or integer, mm; not changed.
       normals: [N, 3], any length; None if there are none.
       name: for messages and reports.
-      sensor_origin: [3] mm, scan frame; ``"auto"``, or ``"unknown"`` for merged or moved clouds.
-      stated_origin: [3] mm, where ``"auto"`` looks for the sensor; None for (0, 0, 0).
-
-    Raises:
-      InputError: arrays of other shapes, fewer than 50 distinct points, or points on one line.
+      sensor_origin: [3] mm, scan frame; ``"unknown"`` for merged or moved clouds; ``"auto"`` for
+        ``stated_origin``, if the cloud looks like a single view from there: see `why_not_from`.
+      stated_origin: [3] mm; None for (0, 0, 0).
     """
     points = np.asarray(points)
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":

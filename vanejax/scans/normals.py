@@ -41,16 +41,10 @@ def estimate_normals(
         normals by less than 1.25 deg, found at some of the points: noisy and dense scans need more.
       at: [n] integer, indices of the points whose normals are wanted; None for all.
 
-    Raises:
-      InputError: arrays of other shapes, values that are not finite, or no points.
+    Arrays of other shapes, values that are not finite, and no points raise InputError.
     """
     points = np.asarray(points)
-    if (
-        points.ndim != 2
-        or points.shape[1] != 3
-        or points.dtype.kind not in "fiu"
-        or not len(points)
-    ):
+    if points.shape[1:] != (3,) or points.dtype.kind not in "fiu" or not len(points):
         raise InputError(
             f"normals need points [N, 3] in mm, got shape {list(points.shape)}, {points.dtype}"
         )
@@ -124,17 +118,12 @@ def _planes_at(
 def _fit_planes(
     offsets: jax.Array, mask: jax.Array, toward: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Planes through B neighbourhoods of K points.
-
-    Args:
-      offsets: [B, K, 3] f32, mm, from the point in question.
-      mask: [K] bool, False at padding.
-      toward: [B, 3], the side to which the normals are to point.
+    """Planes through B neighbourhoods of K points, from offsets [B, K, 3] f32, mm, where ``mask``.
 
     Returns:
-      normals [B, 3]; reliable [B], False where the neighbours lie on a line, at one place, or are
-      a lump; standard error of the normal's direction in its worse axis [B], rad: of n points with
-      variances a < b < c along the axes, sqrt(a / (n b)).
+      normals [B, 3] on the side ``toward`` [B, 3]; reliable [B], False where the neighbours lie on
+      a line, at one place, or are a lump; standard error of the normal's direction in its worse
+      axis [B], rad: of n points with variances a < b < c along the axes, sqrt(a / (n b)).
     """
     mask = mask[None, :, None]
     number = jnp.sum(mask)

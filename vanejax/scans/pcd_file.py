@@ -40,8 +40,7 @@ _LZF_MOST = 264 / 3  # bytes that one longest back reference of three bytes stan
 def read_pcd(path: Path) -> PointFile:
     """The points of a PCD file, and their normals where it has them; NaN rows are kept.
 
-    Raises:
-      InputError: the file is truncated, its counts are wrong, or it is no PCD file.
+    InputError if the file is truncated, its counts are wrong, or it is no PCD file.
     """
     size = path.stat().st_size
     with path.open("rb") as file:

@@ -50,8 +50,7 @@ class _Element:
 def read_ply(path: Path) -> PointFile:
     """The vertices of a PLY file, and their normals where it has them.
 
-    Raises:
-      InputError: the file is truncated, its counts are wrong, or it is no PLY file.
+    InputError if the file is truncated, its counts are wrong, or it is no PLY file.
     """
     size = path.stat().st_size
     with path.open("rb") as file:

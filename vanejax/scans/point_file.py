@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import zipfile
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from vanejax.scans.point_records import (
     MAX_POINTS,
     POINT_NAMES,
     PointFile,
+    check_most,
     read_text_rows,
     split_columns,
     wanted_columns,
@@ -33,8 +35,7 @@ _MESH_SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".step", ".stp")
 def read_points(path: Path) -> PointFile:
     """The points of a PLY, PCD, text (XYZ, TXT, CSV, ASC, PTS), NPZ or NPY file, not cleaned.
 
-    Raises:
-      InputError: the file is missing, empty, a folder, truncated, or of another kind.
+    InputError if the file is missing, empty, a folder, truncated, or of another kind.
     """
     suffix = path.suffix.lower()
     head = read_head(path, max_bytes=MAX_BYTES, advice="thin the scan first")
@@ -98,11 +99,7 @@ def _read_text(path: Path) -> PointFile:
             f"{path}: truncated, or its first line is wrong: it promises {promised:,} points and "
             f"holds {len(rows):,}; copy or export it again"
         )
-    if len(rows) > MAX_POINTS:
-        raise InputError(
-            f"{path}: {len(rows):,} points are more than the {MAX_POINTS:,} that fit in memory; "
-            "thin the scan first"
-        )
+    check_most(path, len(rows))
     points, normals = split_columns(rows)
     notes: tuple[str, ...] = ()
     if normals is not None and not named and not _are_directions(normals):
@@ -115,11 +112,7 @@ def _read_text(path: Path) -> PointFile:
 
 
 def _delimiter(line: str, number: int, path: Path) -> str | None:
-    """What stands between the columns of a line; None for white space.
-
-    Raises:
-      InputError: the numbers have decimal commas.
-    """
+    """What stands between the columns of a line, None for white space; refuses decimal commas."""
     numeric = re.fullmatch(r"[\s\d.,;+\-eE]*", line)
     split_otherwise = ";" in line or re.search(r"\d[ \t]+[-+\d]", line)
     if numeric and split_otherwise and re.search(r"\d,\d", line):
@@ -220,9 +213,7 @@ def _read_array(file: BinaryIO, size: int, path: Path, name: str) -> np.ndarray:
         raise InputError(f"{path}: {name} is damaged, or no NumPy array") from error
     if dtype.kind not in "fiu":
         raise InputError(f"{path}: {name} holds {dtype}, not numbers")
-    count = 1
-    for side in shape:
-        count *= side  # whole numbers of Python: no overflow
+    count = math.prod(shape)  # whole numbers of Python: no overflow
     if count * dtype.itemsize > size:
         raise InputError(
             f"{path}: truncated: {name} promises {count:,} numbers and the file holds {size:,} "

@@ -68,8 +68,7 @@ class Field:
 def wanted_columns(names: Sequence[str], path: Path) -> tuple[list[int], list[int]]:
     """Which columns hold the points, and which the normals (none, if they are not all there).
 
-    Raises:
-      InputError: x, y or z is missing.
+    InputError if x, y or z is missing.
     """
     lower = [name.lower() for name in names]
     points, normals = (
@@ -97,6 +96,11 @@ def check_count(path: Path, count: int, bytes_per_point: int, held: int) -> None
             f"{path}: truncated: it promises {count:,} points ({needed:,} bytes or more) and "
             f"holds {held:,} bytes; copy or export it again"
         )
+    check_most(path, count)
+
+
+def check_most(path: Path, count: int) -> None:
+    """Refuses, by InputError, more points than fit in memory."""
     if count > MAX_POINTS:
         raise InputError(
             f"{path}: {count:,} points are more than the {MAX_POINTS:,} that fit in memory; thin "
@@ -109,8 +113,7 @@ def read_records(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Points [N, 3] f64 and normals [N, 3] f32 or None of packed records, from the file's position.
 
-    Raises:
-      InputError: a coordinate is missing, or the file ends early.
+    InputError if a coordinate is missing, or the file ends early.
     """
     columns = wanted_columns([field.name for field in fields], path)
     dtype = np.dtype([(f"f{i}", f.code, (f.count,)) for i, f in enumerate(fields)])
@@ -132,17 +135,10 @@ def read_records(
 def read_text_records(
     path: Path, fields: Sequence[Field], count: int, *, skip_lines: int, last: bool = True
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points [N, 3] f64 and normals [N, 3] f32 or None of a line for each point.
+    """Points [N, 3] f64 and normals [N, 3] f32 or None of ``count`` lines, one for each point.
 
-    Args:
-      path: the file.
-      fields: the columns of a line.
-      count: of the lines that the header promises.
-      skip_lines: before the first.
-      last: whether the file ends after them.
-
-    Raises:
-      InputError: a coordinate is missing, something is not a number, or there are more or fewer.
+    ``last`` says whether the file ends after them. InputError if a coordinate is missing, something
+    is not a number, or there are more or fewer lines.
     """
     points, normals = wanted_columns([field.name for field in fields], path)
     first = np.cumsum([0] + [field.count for field in fields])
@@ -162,8 +158,7 @@ def read_text_rows(
 ) -> np.ndarray:
     """Numbers [N, len(columns)] f64 of a table in a text file; further options of `np.loadtxt`.
 
-    Raises:
-      InputError: something is not a number, or a row is too short; the message says where.
+    InputError says where something is not a number, or a row is too short.
     """
     options = {"comments": None, "encoding": "latin-1"} | options  # latin-1 takes any bytes
     try:

@@ -38,6 +38,9 @@ def load_scan(
     without one, three columns are x, y, z and three more are normals if they are unit vectors. NPZ
     has ``points`` or ``xyz`` [..., 3] and may have ``normals``. What else a file holds is ignored.
 
+    The scan is in mm; `MeasuredScan.notes` says what was dropped and assumed. A file that cannot be
+    read, is no scan, or makes no sense in ``units`` raises InputError that says what to do.
+
     Args:
       path: the file.
       units: of the numbers in the file: mm, cm, m, in, ft or um. ``"auto"`` takes millimetres, or
@@ -46,13 +49,6 @@ def load_scan(
         and to refuse a wrong unit; None if no part is known.
       sensor_origin: see `clean_scan`; [3] in mm, whatever the file's unit. Where a PCD file states
         a viewpoint, ``"auto"`` looks there.
-
-    Returns:
-      The scan in mm; `MeasuredScan.notes` says what was dropped and assumed.
-
-    Raises:
-      InputError: the file cannot be read, is no scan, or makes no sense in `units`; the message
-        says why and what to do.
     """
     path = Path(path)
     if units != "auto" and units not in MM_PER_UNIT:
@@ -147,18 +143,11 @@ def _unit_advice(size: float, diagonal: float, fitting: list[str]) -> str:
 def save_points(
     path: str | os.PathLike[str], points: np.ndarray, normals: np.ndarray | None = None
 ) -> None:
-    """Writes points as .ply (binary), .pcd (binary), .xyz, .csv (with a header line) or .npz.
+    """Writes points and normals [N, 3], mm, as binary .ply or .pcd, as .xyz, .csv or .npz.
 
-    The file appears complete or not at all. Points keep every bit of float64, but for PCD, where
-    PCL expects float32 (0.03 micrometres at 500 mm); normals keep every bit of float32.
-
-    Args:
-      path: the file, replaced if it is there.
-      points: [N, 3], mm.
-      normals: [N, 3]; None for none.
-
-    Raises:
-      InputError: another suffix, arrays of other shapes, or a place that cannot be written.
+    The file appears complete or not at all, and replaces what is there. Points keep every bit of
+    float64, but for PCD, where PCL expects float32 (0.03 micrometres at 500 mm); normals keep every
+    bit of float32. InputError for another suffix, other shapes, or a place that cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -205,14 +194,13 @@ def _write_records(path: Path, points: np.ndarray, normals: np.ndarray | None, s
         lines += ["FIELDS " + " ".join(names), "SIZE" + " 4" * width, "TYPE" + " F" * width]
         lines += ["COUNT" + " 1" * width, f"WIDTH {len(points)}", "HEIGHT 1"]
         lines += ["VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {len(points)}", "DATA binary"]
+    records = np.empty(len(points), dtype)
+    columns = points.T if normals is None else (*points.T, *normals.T)
+    for name, column in zip(names, columns, strict=True):
+        records[name] = column
     with path.open("wb") as file:
         file.write(("\n".join(lines) + "\n").encode())
-        for start in range(0, len(points), _ROWS_AT_ONCE):
-            rows = slice(start, start + _ROWS_AT_ONCE)
-            block = np.empty(len(points[rows]), dtype)
-            for axis, name in enumerate(names):
-                block[name] = points[rows, axis] if axis < 3 else normals[rows, axis - 3]
-            file.write(block.tobytes())
+        records.tofile(file)
 
 
 def _write_text(path: Path, points: np.ndarray, normals: np.ndarray | None, suffix: str) -> None:

@@ -74,14 +74,9 @@ def segment(
 ) -> Segments:
     """Finds the part among other things; where there are none, everything is the part.
 
-    Args:
-      points: [N, 3] f64, mm, finite, in any frame.
-      part: whose size tells what may be it.
-      sensor_origin: [3] mm, in the same frame; None if unknown. A table has the sensor above it.
-      seed: of the planes tried: same seed, same result.
-
-    Raises:
-      InputError: points of another shape.
+    Points are [N, 3] f64, mm, finite, in any frame (InputError for another shape); the sensor's
+    origin is [3] mm in that frame, None if unknown: a table has the sensor above it. The part's
+    size tells what may be it. The seed is that of the planes tried: same seed, same result.
     """
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):

@@ -75,11 +75,8 @@ class Voxels:
     def pieces(self, sensor_origin: np.ndarray, *, least: int) -> np.ndarray:
         """[V] i32: clusters parted where the surface folds inwards, as between part and clamp.
 
-        What lies between two surfaces, and patches that are too small, go with the next piece.
-
-        Args:
-          sensor_origin: [3] mm: the side of the surface that is outside.
-          least: voxels of a piece.
+        What lies between two surfaces, and patches of fewer than ``least`` voxels, go with the next
+        piece. The outside of the surface is where the sensor is, [3] mm.
         """
         first, second = self.neighbors
         normals = self._normals(sensor_origin)
