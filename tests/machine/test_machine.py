@@ -16,7 +16,7 @@ from vanejax.cli.compensate import FORMATS
 from vanejax.errors import InputError
 from vanejax.machine import frame_notation
 from vanejax.machine.controllers import Compensation, axis_angle_deg, read_frame, rounding_error_mm
-from vanejax.machine.frame_notation import NOTATIONS, notation_of, read_iso, write_iso
+from vanejax.machine.frame_notation import NOTATIONS, notation_of, write_iso
 from vanejax.rigid import RigidTransform
 
 RADIUS = 120.0
@@ -180,14 +180,6 @@ def test_what_is_wrong_with_a_text_is_said(text: str, words: str, tmp_path: Path
     with pytest.raises(InputError, match=words) as error:
         read_frame(path, target="machine", source="part")
     assert str(error.value).startswith(f"{path}: ")
-
-
-def test_the_work_offset_can_be_chosen() -> None:
-    text = write_iso(frame(Rotation.identity()), work_offset=6)
-    assert text.splitlines()[:2] == ["G90 G10 L2 P6 X812.3457 Y-45.0000 Z1300.5000", "G59"]
-    np.testing.assert_allclose(read_iso(text).translation, [812.3457, -45.0, 1300.5], atol=1e-12)
-    with pytest.raises(InputError, match="work offset 7: should be 1 to 6"):
-        write_iso(frame(Rotation.identity()), work_offset=7)
 
 
 def test_the_command_offers_every_notation() -> None:

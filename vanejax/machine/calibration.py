@@ -90,9 +90,8 @@ def calibrate(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> Ca
             break
     misfit = float(np.sqrt(chi / (9 * len(camera_cubes) - 6)))
     covariance = np.linalg.inv(information) * max(1.0, misfit**2)
-    return _with_residuals(
-        machine_from_camera, covariance, center, camera_cubes, machine_cubes, misfit
-    )
+    residuals = _residuals(machine_from_camera, camera_cubes, machine_cubes)
+    return Calibration(machine_from_camera, covariance, center, *residuals, misfit)
 
 
 def averaged(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> Calibration:
@@ -119,7 +118,8 @@ def averaged(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> Cal
     errors = np.column_stack([(turns * mean.inv()).as_rotvec(), shifts - pose.translation])
     count = len(frames)
     spread = errors.T @ errors / (count * (count - 1)) if count > 1 else np.full((6, 6), np.nan)
-    return _with_residuals(pose, spread, center, camera_cubes, machine_cubes, float("nan"))
+    residuals = _residuals(pose, camera_cubes, machine_cubes)
+    return Calibration(pose, spread, center, *residuals, float("nan"))
 
 
 def matched(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> list[Cube]:
@@ -212,21 +212,13 @@ def _disagreement(
     return residual, jacobian, covariance + np.diag([1e-14, 1e-14, 1e-10])
 
 
-def _with_residuals(
-    machine_from_camera: RigidTransform,
-    covariance: np.ndarray,
-    center: np.ndarray,
-    camera_cubes: Sequence[Cube],
-    machine_cubes: Sequence[Cube],
-    misfit: float,
-) -> Calibration:
-    """A calibration with the residuals of its placements."""
-    rotation_deg, corner_mm = [], []
-    for seen, touched in zip(camera_cubes, machine_cubes, strict=True):
-        pose, touched_pose = machine_from_camera @ seen.world_from_cube, touched.world_from_cube
-        rest = Rotation.from_matrix(touched_pose.rotation @ pose.rotation.T)
-        rotation_deg.append(float(np.degrees(rest.magnitude())))
-        corner_mm.append(float(np.linalg.norm(touched_pose.translation - pose.translation)))
-    return Calibration(
-        machine_from_camera, covariance, center, np.array(rotation_deg), np.array(corner_mm), misfit
-    )
+def _residuals(
+    machine_from_camera: RigidTransform, camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Degrees [P] between the frames of each placement, and mm [P] between its corners."""
+    seen = [machine_from_camera @ cube.world_from_cube for cube in camera_cubes]
+    touched = [cube.world_from_cube for cube in machine_cubes]
+    pairs = list(zip(touched, seen, strict=True))
+    rest = Rotation.from_matrix([b.rotation @ a.rotation.T for b, a in pairs])
+    apart = [np.linalg.norm(b.translation - a.translation) for b, a in pairs]
+    return np.degrees(rest.magnitude()), np.array(apart)

@@ -39,7 +39,6 @@ class Face:
       offset_variance: mm^2, of the plane along its normal at the centre; not correlated with the
         normal's error there.
       rms_mm: of the points from the plane.
-      count: of the points.
     """
 
     normal: np.ndarray
@@ -47,7 +46,6 @@ class Face:
     normal_covariance: np.ndarray
     offset_variance: float
     rms_mm: float
-    count: int
 
     def height_mm(self, points: np.ndarray) -> np.ndarray:
         """[N] of points [N, 3] above the plane."""
@@ -128,22 +126,13 @@ def fit_face(points: np.ndarray, *, noise_mm: float = 0.0, form_mm: float = 0.0)
     own = rms * np.sqrt(count / (count - 3)) if count > 3.5 else 0.0
     each = max(own, noise_mm) ** 2 / count + form_mm**2 / min(count, FORM_PATCHES)
     tilts = axes[:, 1:] * np.sqrt(each * count / values[1:])
-    return Face(axes[:, 0], center, tilts @ tilts.T, each, rms, len(points))
+    return Face(axes[:, 0], center, tilts @ tilts.T, each, rms)
 
 
 def cube_of(
-    points: Sequence[np.ndarray],
-    *,
-    noise_mm: float = 0.0,
-    form_mm: float = FORM_MM,
-    most_askew_deg: float = MOST_ASKEW_DEG,
+    points: Sequence[np.ndarray], *, noise_mm: float = 0.0, form_mm: float = FORM_MM
 ) -> Cube:
-    """A cube from points [N, 3] on each of three faces that meet, in any order.
-
-    Args:
-      points: three arrays, at least 3 points in each.
-      noise_mm, form_mm: see `fit_face`.
-      most_askew_deg: how far from square the faces may be.
+    """A cube from points [N, 3] on each of three faces that meet, in any order; see `fit_face`.
 
     Raises:
       InputError: not three planes, or not square to each other.
@@ -154,10 +143,10 @@ def cube_of(
     for i, j in itertools.combinations(range(3), 2):
         cosine = np.clip(faces[i].normal @ faces[j].normal, -1, 1)
         askew = abs(float(np.degrees(np.arcsin(cosine))))
-        if askew > most_askew_deg:
+        if askew > MOST_ASKEW_DEG:
             raise InputError(
                 f"faces {i} and {j} are {askew:.2f} deg from square, more than "
-                f"{most_askew_deg:g}: are their points on one face each, and is it a cube?"
+                f"{MOST_ASKEW_DEG:g}: are their points on one face each, and is it a cube?"
             )
     outward = []
     for face in faces:
@@ -170,18 +159,15 @@ def cube_of(
     return Cube(tuple(outward))
 
 
-def cube_faces(
-    points: np.ndarray, *, side_mm: float = SIDE_MM, reach_mm: float = REACH_MM, seed: int = 0
-) -> np.ndarray:
+def cube_faces(points: np.ndarray, *, seed: int = 0) -> np.ndarray:
     """[N] i8: which of three faces a point of a cube's scan is on, largest first; -1 for none.
 
     Planes through three random points that most others lie on, the later ones square to the
-    earlier to 5 deg. Points within 1.5 mm of a second plane are on none: they may be mixed.
+    earlier to 5 deg. Points near a second plane are on none: they may be mixed. So are those
+    farther from the corner than the cube's faces reach.
 
     Args:
       points: [N, 3] mm, of a scan of the cube and little else.
-      side_mm: of the cube; points farther from the corner than its faces reach are on none.
-      reach_mm: how far from its plane a point of a face may be, three times the noise.
       seed: of the triplets: same seed, same result.
 
     Raises:
@@ -192,44 +178,41 @@ def cube_faces(
         raise InputError(f"a cube needs a scan [N, 3] in mm, got {list(points.shape)}")
     rng = np.random.default_rng(seed)
     some = points[rng.permutation(len(points))[:TRIPLET_POINTS]]
-    normals, anchors = np.zeros((0, 3)), np.zeros((0, 3))
     left = np.ones(len(some), bool)
-    for number in range(3):
-        plane = _likely_plane(some[left], normals, reach_mm, rng)
-        if plane is None or np.mean(plane[2]) * np.mean(left) < LEAST_SHARE:
+    faces: list[Face] = []
+    while len(faces) < 3:
+        face = _likely_face(some[left], faces, rng)
+        off = np.full(len(some), np.inf) if face is None else np.abs(face.height_mm(some))
+        if np.mean((off < REACH_MM) & left) < LEAST_SHARE:
             raise InputError(
-                f"the scan shows {number} of the cube's faces, three are needed: tilt the cube so "
-                "that its corner points to the camera"
+                f"the scan shows {len(faces)} of the cube's faces, three are needed: tilt the cube "
+                "so that its corner points to the camera"
             )
-        normals = np.concatenate([normals, plane[0][None]])
-        anchors = np.concatenate([anchors, plane[1][None]])
-        left &= np.abs((some - plane[1]) @ plane[0]) > 2 * reach_mm
-    height = np.abs(points @ normals.T - np.einsum("ki,ki->k", anchors, normals))
-    order = np.sort(height, axis=1)
-    corner = np.linalg.solve(normals, np.einsum("ki,ki->k", anchors, normals))
-    near = np.linalg.norm(points - corner, axis=1) < side_mm * np.sqrt(2) + EDGE_MM
-    on = (order[:, 0] < reach_mm) & (order[:, 1] > max(EDGE_MM, 2 * reach_mm)) & near
+        faces.append(face)
+        left &= off > 2 * REACH_MM
+    height = np.abs(np.stack([face.height_mm(points) for face in faces], axis=1))
+    nearest, second, _ = np.sort(height, axis=1).T
+    from_corner = np.linalg.norm(points - Cube(tuple(faces)).corner, axis=1)
+    near = from_corner < SIDE_MM * np.sqrt(2) + EDGE_MM
+    on = (nearest < REACH_MM) & (second > max(EDGE_MM, 2 * REACH_MM)) & near
     return np.where(on, np.argmin(height, axis=1), -1).astype(np.int8)
 
 
-def _likely_plane(
-    points: np.ndarray, square_to: np.ndarray, reach_mm: float, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Normal [3] and a point [3] of the plane most of the points lie on, and which those are."""
+def _likely_face(
+    points: np.ndarray, square_to: Sequence[Face], rng: np.random.Generator
+) -> Face | None:
+    """The plane that most of the points [N, 3] lie on, square to the faces known."""
     if len(points) < 9:
         return None
     a, b, c = points[rng.integers(len(points), size=(3, TRIPLETS))]
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
-    fit = length > 0
-    normal, a = normal[fit] / length[fit, None], a[fit]
-    fit = (np.abs(normal @ square_to.T) < np.sin(np.radians(5))).all(axis=1)
+    normal /= np.where(length > 0, length, 1.0)[:, None]
+    cosine = np.abs(normal @ np.reshape([face.normal for face in square_to], (-1, 3)).T)
+    fit = (length > 0) & (cosine < np.sin(np.radians(5))).all(axis=1)
+    if not fit.any():
+        return None
     normal, a = normal[fit], a[fit]
-    if not len(normal):
-        return None
-    on = np.abs(points @ normal.T - np.einsum("ti,ti->t", normal, a)) < reach_mm
+    on = np.abs(points @ normal.T - np.einsum("ti,ti->t", normal, a)) < REACH_MM
     mine = on[:, np.argmax(np.count_nonzero(on, axis=0))]
-    if np.count_nonzero(mine) < 3:
-        return None
-    face = fit_face(points[mine])
-    return face.normal, face.center, np.abs(face.height_mm(points)) < reach_mm
+    return fit_face(points[mine]) if np.count_nonzero(mine) >= 3 else None

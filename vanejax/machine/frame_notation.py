@@ -1,23 +1,21 @@
 """Frames in the notation of controllers: KUKA, ISO G-code, Heidenhain, Siemens, plain matrices.
 
-Every notation is a function that writes and one that reads again, and names its convention and
-source. What is written is rounded to `DECIMALS_MM` and `DECIMALS_DEG`;
+What is written is rounded to `DECIMALS_MM` and `DECIMALS_DEG`;
 `vanejax.machine.controllers.rounding_error_mm` gives the displacement by that. A reader raises
-`InputError` where a component is missing, repeated, unknown or no number. Millimetres and degrees;
-host numpy only.
+`InputError` where a component is missing, repeated, unknown or no number. Millimetres and degrees.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
-from vanejax.machine.pose_file import euler_deg, kuka_frame, parse_transform
+from vanejax.machine.pose_file import euler_deg, parse_transform
 from vanejax.rigid import RigidTransform
 
 DECIMALS_MM = 4
@@ -28,16 +26,8 @@ WORK_OFFSETS = {str(53 + p): p for p in range(1, 7)}  # G10 L2 P1 to P6 are G54 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)"
 
 
-@dataclasses.dataclass(frozen=True)
-class Notation:
-    """A notation of frames.
-
-    Attributes:
-      title: whose it is.
-      formula: of its convention, and its source.
-      write: text of a frame.
-      read: the frame of such a text; raises `InputError`.
-    """
+class Notation(NamedTuple):
+    """Whose notation it is, the formula of its convention, and what writes and reads a frame."""
 
     title: str
     formula: str
@@ -55,9 +45,12 @@ def write_matrix(machine_from_part: RigidTransform) -> str:
 
 
 def write_kuka(machine_from_part: RigidTransform) -> str:
-    """KUKA's FRAME {X, Y, Z, A, B, C}; see `vanejax.machine.pose_file.kuka_frame`."""
-    frame = kuka_frame(machine_from_part)
-    return "{" + ",".join(f"{name} {_fixed(v, _places(name))}" for name, v in frame.items()) + "}"
+    """KUKA's FRAME: A turns about z, B about the y so turned, C about the x turned twice.
+
+    Source: KUKA System Software, operating and programming instructions.
+    """
+    x, y, z, c, b, a = _numbers(machine_from_part, "xyz")
+    return f"{{X {x},Y {y},Z {z},A {a},B {b},C {c}}}"
 
 
 def read_kuka(text: str) -> RigidTransform:
@@ -68,30 +61,19 @@ def read_kuka(text: str) -> RigidTransform:
     items = [re.split(r"\s+", item.strip() + " ", maxsplit=1) for item in match[1].split(",")]
     words = [(name.upper(), value.strip()) for name, value in items]
     values = _values(words, "XYZABC", "the KUKA frame")
-    return _frame(values, "ZYX", [values[name] for name in "ABC"])
+    return _frame(values, values, "ZYX", "ABC")
 
 
-def write_iso(machine_from_part: RigidTransform, *, work_offset: int = 1) -> str:
+def write_iso(machine_from_part: RigidTransform) -> str:
     """A work offset, and a tilted working plane upon it.
 
     G10 L2 P1 sets G54: the part's origin in the machine. G68.2 X Y Z I J K gives a feature
     coordinate system upon the active offset, here with the same origin, turned by Euler angles:
     I about Z, J about the turned X, K about the Z turned twice (Fanuc; post processors call it
     EULER_ZXZ_R).
-
-    Args:
-      machine_from_part: the work frame.
-      work_offset: P of G10 L2, 1 to 6: G54 to G59.
     """
-    if work_offset not in WORK_OFFSETS.values():
-        raise InputError(f"work offset {work_offset}: should be 1 to 6, for G54 to G59")
-    x, y, z = (_fixed(v, DECIMALS_MM) for v in machine_from_part.translation)
-    i, j, k = (_fixed(v, DECIMALS_DEG) for v in euler_deg(machine_from_part.rotation, "ZXZ"))
-    return (
-        f"G90 G10 L2 P{work_offset} X{x} Y{y} Z{z}\n"
-        f"G{53 + work_offset}\n"
-        f"G68.2 X0. Y0. Z0. I{i} J{j} K{k}"
-    )
+    x, y, z, i, j, k = _numbers(machine_from_part, "ZXZ")
+    return f"G90 G10 L2 P1 X{x} Y{y} Z{z}\nG54\nG68.2 X0. Y0. Z0. I{i} J{j} K{k}"
 
 
 def read_iso(text: str) -> RigidTransform:
@@ -118,7 +100,7 @@ def read_iso(text: str) -> RigidTransform:
             if tilted is not None:
                 raise InputError(f"{block} is a second G68.2")
             values = _values(others, "XYZIJK", "G68.2 (with Euler angles, without P)", some=True)
-            tilted = _frame(values, "ZXZ", [values[name] for name in "IJK"])
+            tilted = _frame(values, values, "ZXZ", "IJK")
         elif others or "10" in codes:
             if offset is not None:
                 raise InputError(f"{block} is a second work offset")
@@ -147,9 +129,7 @@ def write_heidenhain(machine_from_part: RigidTransform) -> str:
     SPA, SPB, SPC turn about the fixed X, then Y, then Z, which is the same as C, B, A about the
     turned axes (TNC 620, conversational programming, 10/2017, p. 540). STAY moves no axis.
     """
-    x, y, z = (_fixed(v, DECIMALS_MM, sign="+") for v in machine_from_part.translation)
-    angles = euler_deg(machine_from_part.rotation, "xyz")
-    a, b, c = (_fixed(v, DECIMALS_DEG, sign="+") for v in angles)
+    x, y, z, a, b, c = _numbers(machine_from_part, "xyz", sign="+")
     return (
         "CYCL DEF 7.0 DATUM SHIFT\n"
         f"CYCL DEF 7.1 X{x}\nCYCL DEF 7.2 Y{y}\nCYCL DEF 7.3 Z{z}\n"
@@ -169,7 +149,7 @@ def read_heidenhain(text: str) -> RigidTransform:
         return _frame(values)
     words = re.findall(rf"SP([A-Z])\s*({_NUMBER})(?![\d.])", planes[0])
     angles = _values(words, "ABC", "PLANE SPATIAL, SP")
-    return _frame(values, "ZYX", [angles[name] for name in "CBA"])
+    return _frame(values, angles, "ZYX", "CBA")
 
 
 def write_siemens(machine_from_part: RigidTransform) -> str:
@@ -178,10 +158,8 @@ def write_siemens(machine_from_part: RigidTransform) -> str:
     CTRANS, then CROT with RPY angles: Z, then the turned Y, then the X turned twice (MD10600 = 1,
     the default; SINUMERIK 840D sl, Basic Functions, K2, 11/2006, p. 56).
     """
-    frame = {name: _fixed(v, _places(name)) for name, v in kuka_frame(machine_from_part).items()}
-    shift = ",".join(f"{name},{frame[name]}" for name in "XYZ")
-    turn = ",".join(f"{axis},{frame[name]}" for axis, name in zip("XYZ", "CBA", strict=True))
-    return f"$P_UIFR[1]=CTRANS({shift}):CROT({turn})"
+    x, y, z, a, b, c = _numbers(machine_from_part, "xyz")
+    return f"$P_UIFR[1]=CTRANS(X,{x},Y,{y},Z,{z}):CROT(X,{a},Y,{b},Z,{c})"
 
 
 def read_siemens(text: str) -> RigidTransform:
@@ -199,9 +177,7 @@ def read_siemens(text: str) -> RigidTransform:
         if len(items) % 2:
             raise InputError(f"{name}({inside}) should be pairs of an axis and a number")
         values.append(_values(list(zip(items[::2], items[1::2], strict=True)), "XYZ", name))
-    if len(values) == 1:
-        return _frame(values[0])
-    return _frame(values[0], "ZYX", [values[1][name] for name in "ZYX"])
+    return _frame(*values, "ZYX", "ZYX") if len(values) == 2 else _frame(*values)
 
 
 NOTATIONS: Mapping[str, Notation] = {
@@ -254,21 +230,27 @@ def notation_of(text: str) -> str:
 
 
 def _frame(
-    values: Mapping[str, float], order: str = "ZYX", angles_deg: Sequence[float] = (0, 0, 0)
+    shift: Mapping[str, float],
+    turn: Mapping[str, float] | None = None,
+    order: str = "ZYX",
+    names: str = "ABC",
 ) -> RigidTransform:
-    """The frame at X, Y, Z of ``values``, with three angles in an order as scipy names it."""
+    """The frame at X, Y, Z of ``shift``, turned by named angles in an order as scipy names it."""
+    angles_deg = [turn[name] for name in names] if turn else [0.0, 0.0, 0.0]
     # a whole number of turns less: degrees are exact, radians are not
     rotation = Rotation.from_euler(order, np.remainder(angles_deg, 360.0), degrees=True)
-    return RigidTransform(rotation.as_matrix(), np.array([values[name] for name in "XYZ"]))
+    return RigidTransform(rotation.as_matrix(), np.array([shift[name] for name in "XYZ"]))
+
+
+def _numbers(frame: RigidTransform, order: str, *, sign: str = "") -> list[str]:
+    """X, Y, Z and three angles in an order as scipy names it, rounded."""
+    shift = [_fixed(v, DECIMALS_MM, sign=sign) for v in frame.translation]
+    return shift + [_fixed(v, DECIMALS_DEG, sign=sign) for v in euler_deg(frame.rotation, order)]
 
 
 def _fixed(value: float, places: int, *, sign: str = "") -> str:
     """A number with so many decimals, never -0."""
     return f"{round(float(value), places) + 0.0:{sign}.{places}f}"
-
-
-def _places(name: str) -> int:
-    return DECIMALS_MM if name in "XYZ" else DECIMALS_DEG
 
 
 def _iso_words(line: str) -> list[tuple[str, str]]:

@@ -5,7 +5,6 @@ Frames and units are stated in the file itself. Host numpy only.
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import importlib.metadata
 import json
@@ -14,7 +13,7 @@ import re
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -54,26 +53,15 @@ def pose_to_dict(part_from_camera: RigidTransform) -> dict[str, Any]:
     poses = {"part_from_camera": part_from_camera, "camera_from_part": part_from_camera.inverse()}
     values: dict[str, Any] = {name: pose.as_matrix() for name, pose in poses.items()}
     for name, pose in poses.items():
+        quaternion = Rotation.from_matrix(pose.rotation).as_quat(canonical=True, scalar_first=True)
+        a, b, c = angles = euler_deg(pose.rotation, "xyz")
         values[f"{name}_as"] = {
             "translation_mm": pose.translation,
-            "quaternion_wxyz": Rotation.from_matrix(pose.rotation).as_quat(
-                canonical=True, scalar_first=True
-            ),
-            "euler_xyz_deg": euler_deg(pose.rotation, "xyz"),
-            "kuka": kuka_frame(pose),
+            "quaternion_wxyz": quaternion,
+            "euler_xyz_deg": angles,
+            "kuka": dict(zip("XYZABC", [*pose.translation, c, b, a], strict=True)),
         }
     return _plain(values)
-
-
-def kuka_frame(pose: RigidTransform) -> dict[str, float]:
-    """X, Y, Z in mm and A, B, C in degrees of KUKA's FRAME: R = Rz(A) Ry(B) Rx(C).
-
-    A turns about z, B about the y so turned, C about the x turned twice (KUKA System Software,
-    operating and programming instructions). B is within -90 to 90; at either end A is 0.
-    """
-    x, y, z = np.asarray(pose.translation, np.float64).tolist()
-    a, b, c = euler_deg(pose.rotation, "xyz").tolist()
-    return {"X": x, "Y": y, "Z": z, "A": c, "B": b, "C": a}
 
 
 def euler_deg(rotation: np.ndarray, order: str) -> np.ndarray:
@@ -98,12 +86,8 @@ def result_to_dict(
 ) -> dict[str, Any]:
     """A registration's result without its points, as values that JSON can hold.
 
-    Args:
-      result: what `vanejax.register` gave; a number in it that is not finite becomes None.
-      scan_name, part_name: what was registered to what.
-      part_sha256: `Part.sha256`.
-      seed: of the registration.
-      weights_name: the trained matcher's file.
+    A number that is not finite becomes None. ``part_sha256`` is `Part.sha256`, ``weights_name``
+    the trained matcher's file.
     """
     alternatives = [
         pose_to_dict(other.part_from_camera)
@@ -180,15 +164,8 @@ def write_result(path: str | os.PathLike[str], result: PoseResult, **names: Any)
     write_json(path, result_to_dict(result, **names), allow_nan=False)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class PoseRecord:
-    """What a pose file says that is needed to act on it.
-
-    Attributes:
-      part_from_camera: the pose, f64, mm.
-      verdict: of the registration; None where the file has none, such as one typed by hand.
-      part_sha256: `Part.sha256` of the part that was found; None where the file has none.
-    """
+class PoseRecord(NamedTuple):
+    """What a pose file (f64, mm) says; verdict and `Part.sha256` are None where it has none."""
 
     part_from_camera: RigidTransform
     verdict: Verdict | None
@@ -235,16 +212,10 @@ def read_pose(path: str | os.PathLike[str]) -> RigidTransform:
 def parse_transform(
     text: str, *, where: str, target: str = "part", source: str = "camera"
 ) -> RigidTransform:
-    """The motion between any two frames from text that `read_pose` takes.
+    """The motion target_from_source from text that `read_pose` takes.
 
-    Args:
-      text: JSON or 16 numbers.
-      where: what the message of an error starts with.
-      target, source: names of the frames, in place of part and camera in the names of JSON; what
-        stands without a name is target_from_source.
-
-    Raises:
-      InputError: as `read_pose`.
+    ``where`` begins the messages of its `InputError`. JSON may name the motion or its inverse;
+    what stands without a name is target_from_source.
     """
     if text.lstrip()[:1] in ("{", "["):
         return _from_json(text, where, target, source)
@@ -261,11 +232,7 @@ def parse_transform(
 
 
 def read_text(path: Path) -> str:
-    """The text of a pose file.
-
-    Raises:
-      InputError: no such file, no text, or too large to be a pose.
-    """
+    """The text of a pose file; `InputError` if it cannot be one."""
     try:
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: is a folder or a device; a pose file is JSON or 16 numbers")

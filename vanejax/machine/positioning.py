@@ -6,15 +6,16 @@ the frame of a measuring machine (eq. 13), to be compared with probed points (eq
 
 A small motion e [6] is (rotation vector in rad, translation in mm) about a centre c, applied
 afterwards: ``x -> c + exp(e[:3]) (x - c) + e[3:]``. As in
-`vanejax.localization.pose_result.Uncertainty`, it is the error of what is reported: the truth is
-that small motion after the report. All is first order in it. Host code, float64.
+`vanejax.localization.pose_result.Uncertainty`, the truth is that small motion after what is
+reported. All is first order in it. Host code, float64.
 """
 
 from __future__ import annotations
 
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
@@ -52,13 +53,10 @@ def displacement(motion: RigidTransform, point: np.ndarray) -> np.ndarray:
     return motion.rotation @ point + motion.translation - point
 
 
-@dataclasses.dataclass(frozen=True)
-class Twist:
+class Twist(NamedTuple):
     """A rotation as a turn about a known axis, then a swing about one square to it.
 
-    Attributes:
-      angle_deg: the turn, above -180 to 180.
-      swing_deg: 0 to 180: what is left over; 0 if the rotation is about that axis.
+    The turn is above -180 and up to 180 deg, the swing (0 for a rotation about that axis) 0 to 180.
     """
 
     angle_deg: float
@@ -71,7 +69,7 @@ def twist_about(rotation: np.ndarray, axis: np.ndarray) -> Twist:
     Raises:
       InputError: an axis that is no direction, or a rotation that swings by half a turn.
     """
-    real, along, imaginary = _about(rotation, axis)
+    real, along, imaginary, axis = _about(rotation, axis)
     length = float(np.hypot(real, along))
     if length < _FLIPPED:
         raise InputError(
@@ -79,7 +77,7 @@ def twist_about(rotation: np.ndarray, axis: np.ndarray) -> Twist:
             "axis given in the rotation's frame?"
         )
     angle = np.degrees(2 * np.arctan2(along, real))
-    across = float(np.linalg.norm(imaginary - along * _unit(axis)))
+    across = float(np.linalg.norm(imaginary - along * axis))
     swing = float(np.degrees(2 * np.arctan2(across, length)))
     return Twist(float(wrapped_deg(angle)), swing)
 
@@ -89,19 +87,16 @@ def wrapped_deg(angle: np.ndarray | float) -> np.ndarray | float:
     return -np.mod(180.0 - np.asarray(angle, np.float64), 360.0) + 180.0
 
 
-def _unit(axis: np.ndarray) -> np.ndarray:
+def _about(rotation: np.ndarray, axis: np.ndarray) -> tuple[float, float, np.ndarray, np.ndarray]:
+    """The quaternion's real part, its imaginary part along the axis and whole; the unit axis."""
     axis = np.asarray(axis, np.float64)
     length = np.linalg.norm(axis)
     if axis.shape != (3,) or not 0 < length < np.inf:
         raise InputError(f"an axis must be a direction, three numbers not all 0; got {axis}")
-    return axis / length
-
-
-def _about(rotation: np.ndarray, axis: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """The quaternion's real part, its imaginary part along the unit axis, and that part itself."""
-    *imaginary, real = Rotation.from_matrix(rotation).as_quat(canonical=True)
-    imaginary = np.asarray(imaginary)
-    return float(real), float(imaginary @ _unit(axis)), imaginary
+    axis = axis / length
+    quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    imaginary = quaternion[:3]
+    return float(quaternion[3]), float(imaginary @ axis), imaginary, axis
 
 
 def common_axis(rotations: np.ndarray) -> np.ndarray:
@@ -143,19 +138,6 @@ def probe_translation(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return np.mean(after - before, axis=0)
 
 
-# Errors to first order. e about c is v + w x (x - c): two matrices carry it anywhere.
-
-
-def turned(rotation: np.ndarray) -> np.ndarray:
-    """[6, 6]: a small motion about c, in another frame and about the same c there.
-
-    ``rotation`` [3, 3] is that of other_from_this.
-    """
-    both = np.zeros((6, 6))
-    both[:3, :3] = both[3:, 3:] = rotation
-    return both
-
-
 def recentred(center: np.ndarray, new_center: np.ndarray) -> np.ndarray:
     """[6, 6]: a small motion about ``center`` as one about ``new_center``: v + w x (new - old)."""
     x, y, z = np.asarray(new_center, np.float64) - center
@@ -164,8 +146,7 @@ def recentred(center: np.ndarray, new_center: np.ndarray) -> np.ndarray:
     return out
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class MotionErrors:
+class MotionErrors(NamedTuple):
     """How errors of two registrations and of the calibration reach the motion they give.
 
     The error of the motion, a small motion about ``center`` applied after it, is
@@ -197,9 +178,8 @@ class MotionErrors:
     ) -> np.ndarray:
         """[6, K]: the error of the motion by K causes that act on everything at once.
 
-        Each has a column in ``before`` and ``after`` (both [6, K], errors of the registrations) and
-        in ``calibration`` (of machine_from_camera; None for nothing). ``common @ common.T`` is a
-        covariance if the columns are for one standard deviation of independent causes.
+        Each has a column in every argument. ``common @ common.T`` is a covariance if the columns
+        are for one standard deviation of independent causes.
         """
         total = self.of_before @ before + self.of_after @ after
         return total if calibration is None else total + self.of_calibration @ calibration
@@ -228,11 +208,12 @@ def motion_errors(
         machine_from_camera = RigidTransform.identity(dtype=np.float64)
     machine_from_part = machine_from_camera @ after.inverse()
     center = machine_from_part.rotation @ part_center + machine_from_part.translation
-    carried = turned(machine_from_part.rotation)
+    carried = block_diag(machine_from_part.rotation, machine_from_part.rotation)
     motion = in_machine(camera_motion(before, after), machine_from_camera)
     place = np.zeros(3) if calibration_center is None else np.asarray(calibration_center)
     arrived = motion.rotation @ place + motion.translation
-    calibration = recentred(place, center) - recentred(arrived, center) @ turned(motion.rotation)
+    turned = block_diag(motion.rotation, motion.rotation)
+    calibration = recentred(place, center) - recentred(arrived, center) @ turned
     return MotionErrors(center, carried, -carried, calibration)
 
 
@@ -242,8 +223,7 @@ def twist_gradient(rotation: np.ndarray, axis: np.ndarray) -> np.ndarray:
     With the quaternion (q0, q): ``(q0 (q0 a + q x a) + (q . a) q) / (q0^2 + (q . a)^2)``; of a
     rotation about the axis a itself, a.
     """
-    real, along, imaginary = _about(rotation, axis)
-    axis = _unit(axis)
+    real, along, imaginary, axis = _about(rotation, axis)
     turned_axis = real * axis + np.cross(imaginary, axis)
     return (real * turned_axis + along * imaginary) / (real**2 + along**2)
 
