@@ -1,13 +1,10 @@
-"""Turbine airfoil sections by Pritchard's eleven-parameter model.
+"""Turbine airfoil sections by Pritchard's eleven-parameter model (ASME 85-GT-219, 1985).
 
-The plane of a section is the unrolled cylinder: the first coordinate is axial (downstream), the
-second tangential. Angles are metal angles from the axial direction, positive towards positive
-tangential. The origin is the centre of the trailing edge's circle; the leading edge lies at
-negative axial and positive tangential coordinates, and the suction side faces positive tangential.
-
-Source: L. J. Pritchard, "An Eleven Parameter Axial Turbine Airfoil Geometry Model", ASME
-85-GT-219 (1985). Nine parameters are fields of `Airfoil`; the other two, radius and number of
-blades, enter only through the pitch.
+The plane of a section is the unrolled cylinder: axial (downstream), then tangential. Angles are
+metal angles from the axial direction, positive towards positive tangential. The origin is the
+centre of the trailing edge's circle; the leading edge lies at negative axial and positive
+tangential coordinates, and the suction side faces positive tangential. Nine parameters are fields
+of `Airfoil`; radius and number of blades enter only through the pitch.
 """
 
 from __future__ import annotations
@@ -15,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.optimize
@@ -27,11 +24,7 @@ _SUCTION_ARC, _SUCTION_CUBIC, _LEADING_EDGE, _PRESSURE_CUBIC, _TRAILING_EDGE = 1
 
 
 def require_number(owner: str, field: str, value: object, low: float, high: float) -> None:
-    """Refuses a value that is no number from ``low`` to ``high``.
-
-    Raises:
-      InputError: naming the owner, the field, the value and the range.
-    """
+    """Raises `InputError` for a value that is no number from ``low`` to ``high``."""
     number = isinstance(value, numbers.Real) and not isinstance(value, bool)
     if not number or not low <= value <= high:
         raise InputError(
@@ -39,8 +32,7 @@ def require_number(owner: str, field: str, value: object, low: float, high: floa
         )
 
 
-@dataclass(frozen=True)
-class Section:
+class Section(NamedTuple):
     """The closed contour of one airfoil.
 
     Attributes:
@@ -59,9 +51,9 @@ class Section:
         return self.contour_mm + distance_mm * self.normals
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Airfoil:
-    """The parameters of one section; tangential direction and signs as in the module's docstring.
+    """The parameters of one section; signs as in the module's docstring.
 
     Attributes:
       axial_chord_mm: axial length from the leading edge's foremost to the trailing edge's last
@@ -159,18 +151,14 @@ class Airfoil:
                 "edge's suction tangency, but it must lie downstream of it; make axial_chord_mm "
                 "larger or throat_mm smaller."
             )
-        suction = _cubic(
-            leading[0], beta[0] + inlet_wedge, throat, throat_angle, _SUCTION_CUBIC, upper=True
-        )
-        pressure = _cubic(
-            leading[-1], beta[0] - inlet_wedge, trailing[0], beta[1] + wedge, _PRESSURE_CUBIC,
-            upper=False,
-        )  # fmt: skip
+        inlet, outlet = beta[0] + inlet_wedge * np.array([1, -1]), beta[1] + wedge
+        upper, above = _cubic(leading[0], inlet[0], throat, throat_angle, _SUCTION_CUBIC)
+        lower, below = _cubic(leading[-1], inlet[1], trailing[0], outlet, _PRESSURE_CUBIC)
         pieces = [
             (arc, arc_normals),
-            (suction[0][::-1], suction[1][::-1]),
+            (upper[::-1], above[::-1]),
             (leading, _direction(le_angles)),
-            pressure,
+            (lower, -below),
             (trailing, _direction(te_angles)),
         ]
         contour = np.concatenate([points[:-1] for points, _ in pieces])
@@ -208,11 +196,7 @@ class Airfoil:
 
 
 def require_simple(contour_mm: np.ndarray, name: str) -> None:
-    """Refuses a closed polygon [P, 2] that crosses itself or runs clockwise.
-
-    Raises:
-      InputError: naming ``name`` and the place of the first crossing in mm.
-    """
+    """Raises `InputError` for a closed polygon [P, 2] that crosses itself or runs clockwise."""
     start, end = contour_mm, np.roll(contour_mm, -1, axis=0)
     along = end - start
 
@@ -239,19 +223,12 @@ def _direction(angle: np.ndarray | float) -> np.ndarray:
 
 
 def _cubic(
-    start: np.ndarray,
-    start_angle: float,
-    end: np.ndarray,
-    end_angle: float,
-    count: int,
-    *,
-    upper: bool,
+    start: np.ndarray, start_angle: float, end: np.ndarray, end_angle: float, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pritchard's cubic tangential(axial) between two points with given slopes.
+    """Points and upward normals [count + 1, 2] of Pritchard's cubic tangential(axial).
 
-    Returns:
-      points and normals [count + 1, 2], equally spaced in a mixture of arc length and turning, so
-      that flat stretches keep some points and bends get most; normals point up or down.
+    They are equally spaced in a mixture of arc length and turning, so that flat stretches keep
+    some points and bends get most.
     """
     width = end[0] - start[0]
     slopes = np.tan([start_angle, end_angle])
@@ -269,5 +246,4 @@ def _cubic(
     u = np.interp(np.linspace(0, knots[-1], count + 1), knots, u)
     points = np.stack([start[0] + width * u, start[1] + width * height(u)], -1)
     points[-1] = end
-    normals = _direction(np.arctan(height.deriv()(u)) + math.pi / 2)
-    return points, normals if upper else -normals
+    return points, _direction(np.arctan(height.deriv()(u)) + math.pi / 2)

@@ -33,14 +33,7 @@ Mesh = tuple[np.ndarray, np.ndarray, tuple[str, ...]]
 
 
 def read_triangles(path: Path, *, units: str) -> Mesh:
-    """The triangles of a file, unchecked but for what reading needs.
-
-    Args:
-      path: a file with a suffix of `READERS`; all bodies in it are put together.
-      units: unit of the numbers in the file, a key of `MM_PER_UNIT`.
-
-    Returns:
-      A mesh that need not be finite or closed.
+    """All triangles of a file with a suffix of `READERS`; they need not be finite or closed.
 
     Raises:
       InputError: the file is missing, empty, truncated, too large or of another kind.
@@ -71,7 +64,7 @@ def _read_stl(data: bytes, path: Path, units: str) -> Mesh:
 
 
 def _stl_corners(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Corners [3F, 3] f64 in file units of a binary or ASCII STL file."""
+    """Corners [3F, 3] f64 in file units."""
     stated = int.from_bytes(data[80:84], "little") if len(data) >= 84 else 0
     held = max(len(data) - 84, 0)
     exact = len(data) >= 84 and held == stated * _FACET.itemsize
@@ -225,18 +218,17 @@ def _glb_of_step(data: bytes, path: Path, units: str) -> bytes:
 
 def _step_unit(data: bytes) -> str | None:
     """The unit of length of a STEP file, None where it names none or several."""
-    names = {"MILLI": "mm", "CENTI": "cm", "MICRO": "um", "": "m", "INCH": "in", "FOOT": "ft"}
+    names = {"MILLI": "mm", "CENTI": "cm", "MICRO": "um", None: "m", "INCH": "in", "FOOT": "ft"}
     units = set()
     for listed in re.findall(rb"GLOBAL_UNIT_ASSIGNED_CONTEXT\s*\(\s*\(([^)]*)\)", data):
         for entity in re.findall(rb"#\d+", listed):
             match = re.search(rb"(?<!\w)" + entity + rb"\s*=\s*([^;]*);", data)
-            body = match.group(1).decode("latin-1").upper() if match else ""
+            body = match[1].decode("latin-1").upper() if match else ""
             if "LENGTH_UNIT" not in body:
                 continue
             si = re.search(r"SI_UNIT\s*\(\s*(?:\.(\w+)\.|\$)\s*,\s*\.METRE\.", body)
             based = re.search(r"CONVERSION_BASED_UNIT\s*\(\s*'(\w+)'", body)
-            name = (si.group(1) or "") if si else based.group(1) if based else "?"
-            units.add(names.get(name))
+            units.add(names.get(si[1]) if si else names.get(based[1]) if based else None)
     return units.pop() if len(units) == 1 else None
 
 

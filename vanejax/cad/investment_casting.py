@@ -77,14 +77,9 @@ class InvestmentCasting:
 def as_cast(part: Part, casting: InvestmentCasting, rng: np.random.Generator) -> Part:
     """One casting of a part, in the CAD model's frame.
 
-    Args:
-      part: the CAD model, a closed solid.
-      casting: how it differs; where it does not, the answer is ``part`` itself.
-      rng: draws the waviness and the direction of the bow; equal generators give equal bits,
-        and each of the two is the same whether or not the other is switched on.
-
-    Returns:
-      The casting, closed, with finer faces than the part where the waviness needs them.
+    It is closed, with finer faces where the waviness needs them; without any deviation it is the
+    part itself. Waviness and direction of the bow are drawn apart: equal generators give equal
+    bits, and each of the two is the same whether or not the other is switched on.
 
     Raises:
       InputError: the part is no solid, or too large for so short a wavelength.
@@ -127,10 +122,6 @@ def offset_directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     smooth surface it is the unit normal and at the edge of a box it is sqrt(2) long, to one per
     mille. In a concave corner the mitres alone would fold the surface over: there vertices of a
     flat face that are near the corner must move along the face out of its way, and do.
-
-    Args:
-      points: [V, 3] f64, mm.
-      faces: [F, 3] int, outward.
     """
     shapes = Triangles(points, faces)
     area = shapes.areas()

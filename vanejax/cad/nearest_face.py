@@ -65,7 +65,10 @@ class NearestFace:
                 ended = []
                 for block in np.array_split(rows, 1 + len(rows) * last // PAIRS_AT_ONCE):
                     middle, order = tree.query(points[block], k=range(first + 1, last + 1))
-                    self._try_faces(points, block, faces[order], middle, best, closest)
+                    tried = faces[order]
+                    near = middle - self._radii[tried] <= best[block, None] + TIE_MM
+                    row, column = np.nonzero(near)
+                    self._try_faces(points, block[row], tried[row, column], best, closest)
                     ended.append(middle[:, -1] - largest > best[block] + TIE_MM)
                 rows = rows[~np.concatenate(ended)] if last < len(faces) else rows[:0]
                 first, last = last, min(2 * last, len(faces))
@@ -74,34 +77,22 @@ class NearestFace:
     def _try_faces(
         self,
         points: np.ndarray,
-        rows: np.ndarray,
-        faces: np.ndarray,
-        middle: np.ndarray,
+        point: np.ndarray,
+        face: np.ndarray,
         best: np.ndarray,
         closest: ClosestPoints,
     ) -> None:
-        """Takes the faces [n, k] of the points ``rows``, where one is nearer than the best."""
-        row, column = np.nonzero(middle - self._radii[faces] <= best[rows, None] + TIE_MM)
-        if not len(row):
-            return
-        point, face = rows[row], faces[row, column]
-        foot = closest_point(self._corners[face], points[point])
+        """Takes a face [n] for a point [n] where it is nearer than the best, which changes too."""
+        # the foot that was the best so far stays in the choice
+        known = np.unique(point)
+        known = known[np.isfinite(best[known])]
+        foot = closest_point(self._corners[face], points[point]) if len(face) else np.zeros((0, 3))
+        foot = np.concatenate([foot, closest.points[known]])
+        point, face = np.concatenate([point, known]), np.concatenate([face, closest.face[known]])
         off = points[point] - foot
         distance = np.linalg.norm(off, axis=1)
         facing = np.abs(np.einsum("ni,ni->n", off, self._normals[face]))
-        nearest = best.copy()
-        np.minimum.at(nearest, point, distance)
-        # the foot that was the best so far stays in the choice
-        known = np.unique(point)
-        known = known[best[known] <= nearest[known] + TIE_MM]
-        point = np.concatenate([point, known])
-        foot = np.concatenate([foot, closest.points[known]])
-        face = np.concatenate([face, closest.face[known]])
-        off = points[known] - closest.points[known]
-        old = np.abs(np.einsum("ni,ni->n", off, closest.normals[known]))
-        distance, facing = np.concatenate([distance, best[known]]), np.concatenate([facing, old])
-        tied = np.flatnonzero(distance <= nearest[point] + TIE_MM)
+        np.minimum.at(best, point, distance)
+        tied = np.flatnonzero(distance <= best[point] + TIE_MM)
         tied = tied[np.argsort(facing[tied], kind="stable")]  # the last one written stays
-        which = point[tied]
-        closest.put(which, ClosestPoints(foot[tied], self._normals[face[tied]], face[tied]))
-        best[:] = nearest
+        closest.put(point[tied], ClosestPoints(foot[tied], self._normals[face[tied]], face[tied]))

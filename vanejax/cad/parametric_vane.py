@@ -157,6 +157,11 @@ class GuideVaneSegment:
         return self.inner_radius_mm * self.pitch_rad
 
     @property
+    def gap_rad(self) -> float:
+        """Angle between neighbouring segments in radians."""
+        return self.segment_gap_mm / self.inner_radius_mm
+
+    @property
     def front_mm(self) -> float:
         """Axial place of the platforms' upstream edge, negative."""
         airfoils = (self.inner_airfoil, self.outer_airfoil)
@@ -190,12 +195,8 @@ DOUBLET = GuideVaneSegment()
 def guide_vane(segment: GuideVaneSegment = DOUBLET) -> Part:
     """Builds the segment as one watertight solid without inner walls.
 
-    Args:
-      segment: its sizes.
-
-    Returns:
-      The part in mm, in the frame of the module's docstring; the same segment gives the same
-      vertices and faces, bit for bit.
+    The part is in the frame of the module's docstring; the same segment gives the same vertices
+    and faces, bit for bit.
 
     Raises:
       InputError: if an airfoil crosses itself, or a vane does not fit onto its platforms.
@@ -204,7 +205,7 @@ def guide_vane(segment: GuideVaneSegment = DOUBLET) -> Part:
     middle = _platform_middle(segment, vane)
     pitches = (np.arange(segment.vanes) - (segment.vanes - 1) / 2) * segment.pitch_rad
     solids = [_loft(vane + np.array([0, pitch, 0]), _SECTION) for pitch in pitches]
-    half_width = 0.5 * (segment.vanes * segment.pitch_rad - _gap_angle(segment))
+    half_width = 0.5 * (segment.vanes * segment.pitch_rad - segment.gap_rad)
     inner, outer, rail_slot = _platform_profiles(segment)
     solids += [
         _loft(_sweep(segment, profile, middle - half_width, middle + half_width), _PROFILE)
@@ -219,10 +220,6 @@ def guide_vane(segment: GuideVaneSegment = DOUBLET) -> Part:
     vertices = np.asarray(mesh.vert_properties)[:, :3]
     vertices = vertices - 0.5 * (vertices.min(0) + vertices.max(0))
     return part_from_mesh(vertices, np.asarray(mesh.tri_verts), name="guide-vane segment")
-
-
-def _gap_angle(segment: GuideVaneSegment) -> float:
-    return segment.segment_gap_mm / segment.inner_radius_mm
 
 
 def _vane_rings(segment: GuideVaneSegment) -> np.ndarray:
@@ -259,14 +256,10 @@ def _vane_rings(segment: GuideVaneSegment) -> np.ndarray:
 
 
 def _platform_middle(segment: GuideVaneSegment, vane: np.ndarray) -> float:
-    """Angle of the platforms' middle at axial 0, so that the vanes stand centred between the ends.
-
-    Raises:
-      InputError: if the vane with its fillets is wider than a pitch along the platforms' ends.
-    """
+    """Angle of the platforms' middle at axial 0, so that the vanes stand centred between them."""
     across = vane[..., 1] - _slash(segment, vane[..., 0])
     low, high = across.min(), across.max()
-    room = segment.pitch_rad - _gap_angle(segment)
+    room = segment.pitch_rad - segment.gap_rad
     if high - low >= room:
         raise InputError(
             f"GuideVaneSegment: along slash_angle_deg = {segment.slash_angle_deg:g} a vane with "
@@ -346,12 +339,10 @@ def _sweep(
 
 
 def _loft(rings: np.ndarray, flat: tuple[int, int]) -> manifold3d.Manifold:
-    """The solid whose skin joins rings of ring coordinates, in x, y, z about the engine's axis.
+    """The solid, in x, y, z about the engine's axis, whose skin joins rings [S, P, 3].
 
-    Args:
-      rings: [S, P, 3]; ring i and i + 1 are joined point by point.
-      flat: the two ring coordinates in which the first and the last ring are simple polygons,
-        counter-clockwise; their triangles close the ends.
+    ``flat`` names the two ring coordinates in which the first and the last ring are simple
+    polygons, counter-clockwise; their triangles close the ends.
     """
     stations, count, _ = rings.shape
     axial, angle, radius = np.moveaxis(rings, -1, 0)
@@ -374,5 +365,4 @@ def _loft(rings: np.ndarray, flat: tuple[int, int]) -> manifold3d.Manifold:
     # (axial, angle, radius) -> (x, y, z) mirrors; so does reading a profile as (axial, radius)
     if flat == _SECTION:
         faces = faces[:, ::-1]
-    mesh = manifold3d.Mesh64(vertices.reshape(-1, 3), faces.astype(np.uint64))
-    return manifold3d.Manifold(mesh)
+    return manifold3d.Manifold(manifold3d.Mesh64(vertices.reshape(-1, 3), faces.astype(np.uint64)))

@@ -80,11 +80,7 @@ class Part:
         return digest.hexdigest()
 
     def sample(self, count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points drawn uniformly over the area of the surface.
-
-        Args:
-          count: N, at least 1.
-          seed: of numpy's default generator; the same part and seed give the same points.
+        """``count`` points drawn uniformly over the area; the same seed gives the same points.
 
         Returns:
           points [N, 3] f64, mm; outward unit normals [N, 3] f64; face [N] i32.
@@ -120,11 +116,12 @@ class Part:
                 f"{path}: cannot write {suffix or 'a file without suffix'}; "
                 "use .stl, .ply, .obj or .glb"
             )
-        scene = trimesh.Scene()
-        # glTF is in metres: the node scales, so that the vertices keep every bit
-        scale = np.diag([1e-3, 1e-3, 1e-3, 1.0])
-        scene.add_geometry(self.mesh, transform=scale if suffix == ".glb" else None)
-        data = (scene if suffix == ".glb" else self.mesh).export(file_type=suffix[1:])
+        written = self.mesh
+        if suffix == ".glb":
+            # glTF is in metres: the node scales, so that the vertices keep every bit
+            written = trimesh.Scene()
+            written.add_geometry(self.mesh, transform=np.diag([1e-3, 1e-3, 1e-3, 1.0]))
+        data = written.export(file_type=suffix[1:])
         with atomic_write(path) as partial:
             partial.write_bytes(data.encode() if isinstance(data, str) else data)
 
@@ -192,10 +189,9 @@ def part_from_mesh(
 def _check_size(
     read: float, units: str, sizes_mm: tuple[float, float], path: Path
 ) -> tuple[str, ...]:
-    """Refuses a part that the camera cannot see whole or hardly sees, and names a likely unit.
+    """Refuses a longest side ``read`` in mm that the camera does not see, and names a likely unit.
 
-    ``read`` is the longest side of the bounding box in mm. The answer is empty, or a note where
-    the part is so small that the unit may be wrong.
+    The answer is empty, or a note where the part is so small that the unit may be wrong.
     """
     smallest, largest = sizes_mm
     sizes = {unit: read / MM_PER_UNIT[units] * MM_PER_UNIT[unit] for unit in _UNIT_NAMES}

@@ -102,8 +102,7 @@ class Surface:
     def exact(self, points: np.ndarray) -> ClosestPoints:
         """The foot points on the faces of the nearest few samples, to rounding.
 
-        The nearest face of all can be missed where it is smaller than the samples' spacing; the
-        foot point is then on its neighbour, off by less than that face.
+        A nearer face smaller than the samples' spacing can be missed: off by less than that face.
         """
         _, index = self._tree.query(points, k=CANDIDATES)
         faces = self.face[index].reshape(-1)

@@ -50,8 +50,7 @@ class DenseSurface:
 
     A sample counts as a disc of its normal with as much radius as samples are apart, so a part's
     exact symmetries give no more than the sag of its facets; the price is that an edge seems to
-    reach that much (0.3 to 0.6 mm) farther. The exact distance to the triangles (closest of all)
-    would take a spatial tree of triangles, which no dependency has.
+    reach that much (0.3 to 0.6 mm) farther.
     """
 
     def __init__(self, part: Part) -> None:
@@ -114,15 +113,12 @@ def _candidates(part: Part) -> np.ndarray:
             flip = Rotation.from_rotvec(math.pi * frame[:, (i + 1) % 3])
             turns += [about.as_matrix(), (about * flip).as_matrix()]
         turns.append(frame @ Rotation.create_group("I").as_matrix() @ frame.T)
-    rotations = _different(np.concatenate(turns))
-    return RigidTransform(rotations, center - rotations @ center).as_matrix()
-
-
-def _different(rotations: np.ndarray) -> np.ndarray:
-    """Those of [K, 3, 3] that are not within 1 deg of an earlier one."""
+    rotations = np.concatenate(turns)
     cosine = 0.5 * (np.einsum("aij,bij->ab", rotations, rotations) - 1)
-    same = cosine > math.cos(math.radians(1))
-    return rotations[[i for i in range(len(same)) if not same[i, :i].any()]]
+    # an earlier one within 1 deg is the same
+    same = np.tril(cosine > math.cos(math.radians(1)), -1)
+    rotations = rotations[~same.any(axis=1)]
+    return RigidTransform(rotations, center - rotations @ center).as_matrix()
 
 
 def near_symmetries(
@@ -139,9 +135,7 @@ def near_symmetries(
     15 deg or so.
 
     Args:
-      part: whose.
-      symmetries: [S, 4, 4], the exact ones, identity included.
-      continuous_axis: point and direction of an axis of exact continuous symmetry.
+      symmetries, continuous_axis: the exact ones, as for `pose_error`.
       more: [K, 4, 4] further motions to try.
 
     Returns:
@@ -153,11 +147,10 @@ def near_symmetries(
 
     def is_new(matrix: np.ndarray, known: list[np.ndarray], angle_deg: float) -> bool:
         frame = {"center": part.center, "radius_mm": part.radius}
-        poses = map(RigidTransform.from_matrix, [matrix, *known])
-        pose = next(poses)
+        pose, *others = map(RigidTransform.from_matrix, [matrix, *known])
         errors = (
             pose_error(pose, other, symmetries, continuous_axis=continuous_axis, **frame)
-            for other in poses
+            for other in others
         )
         return all(e[0] > angle_deg or e[1] > SAME_SHIFT * part.radius for e in errors)
 
@@ -207,8 +200,7 @@ def pose_error(
     Args:
       part_from_camera, truth: the pose and a right one, mm.
       symmetries: [S, 4, 4] in the part's frame, identity included.
-      center: [3] mm, the part's centre in its frame.
-      radius_mm: the part's radius, to weigh angles against distances.
+      center, radius_mm: `Part.center` and `Part.radius`.
       continuous_axis: point [3] and unit direction [3] in the part's frame, or None.
 
     Returns:
