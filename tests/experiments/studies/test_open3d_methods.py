@@ -17,18 +17,11 @@ from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 
 FEATURES = {"feature_radius": 0.4, "max_distance": 0.06}
+TO_PLANES = {"metric": "point_to_plane", "max_distance": 0.3}
 METHODS = {
     "icp to points": ("icp", {"metric": "point_to_point", "max_distance": 0.3}),
-    "icp to planes": ("icp", {"metric": "point_to_plane", "max_distance": 0.3}),
-    "robust icp": (
-        "icp",
-        {
-            "metric": "point_to_plane",
-            "max_distance": 0.3,
-            "kernel": "tukey",
-            "kernel_width": 0.2,
-        },
-    ),
+    "icp to planes": ("icp", TO_PLANES),
+    "robust icp": ("icp", TO_PLANES | {"kernel": "tukey", "kernel_width": 0.2}),
     "ransac": ("ransac", FEATURES),
     "fgr": ("fgr", FEATURES),
 }
