@@ -24,7 +24,10 @@ DISTANCE_MM = 400.0
 ELEVATION_DEG = 75.0
 BISECTIONS = 14
 # the paper's mean RMSE and FFMDE over a series (Fig. 11)
-PAPER_MM = {"distance": (0.7951, 0.3620), "angle": (0.7904, 0.3620)}
+PAPER = {
+    "distance": {"rmse_mm": 0.7951, "ffmde_abs_mm": 0.3620},
+    "angle": {"rmse_mm": 0.7904, "ffmde_abs_mm": 0.3620},
+}
 MOST_STOPS = 8.0  # how far exposure is turned up or down to make holes, powers of two
 
 
@@ -67,89 +70,84 @@ class Series:
     take: Callable[[float, int], Disturbed]
     views: int
     max_allowance_mm: float = 0.0
-    paper: tuple[float, float] | None = None
+    paper: dict[str, float] | None = None
 
 
-def make_series(part: Part, *, views: int, seed: int) -> list[Series]:
-    """All series on one part that stands still, with so many scans at each strength.
+class Stand:
+    """A part that stands still before cameras of the kind `SENSOR`, another one for each scan."""
 
-    Each scan is by another camera of the kind `SENSOR`.
-    """
-    stand = _Stand(part, preset(SENSOR), seed)
-    stock_mm = (0.0, 0.25, 0.5, 0.75, 1.0)
-    distances_mm = (300.0, 350.0, 400.0, 450.0, 500.0, 600.0, 800.0, 1000.0)
-    angles_deg = tuple(float(angle) for angle in range(0, 360, 10))
-    saturated = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
-    chips, clamps = (0.0, 10.0, 20.0, 40.0, 80.0), (0.0, 1.0, 2.0, 3.0, 4.0)
-    noise_px = (0.0, 0.02, 0.05, 0.1, 0.2)
-    light, noise = "% of the pixels saturated", "px of disparity"
-    table = (
-        ("distance", "Distance", "mm", distances_mm, stand.at_distance),
-        ("angle", "Angle", "deg", angles_deg, stand.at_angle),
-        ("light", "Strong light", light, saturated, stand.in_light),
-        ("chips", "Chips and drops", "of each on the part", chips, stand.among_chips),
-        ("fixture", "Table and clamps", "clamps", clamps, stand.in_fixture),
-        ("casting", "Casting allowance", "mm", stock_mm, stand.as_cast),
-        ("stock", "The same, stock estimated", "mm", stock_mm, stand.as_cast),
-        ("noise", "Correlated noise", noise, noise_px, stand.with_noise),
-    )
-    return [
-        Series(
-            *row,
-            views=1 if row[0] == "angle" else views,
-            max_allowance_mm=1.0 if row[0] == "stock" else 0.0,
-            paper=PAPER_MM.get(row[0]),
-        )
-        for row in table
-    ]
-
-
-class _Stand:
-    """The part, the kind of camera, and how each disturbance changes a scan."""
-
-    def __init__(self, part: Part, sensor: Sensor, seed: int) -> None:
-        self.part, self.sensor, self.seed = part, sensor, seed
+    def __init__(self, part: Part, seed: int) -> None:
+        self.part, self.sensor, self.seed = part, preset(SENSOR), seed
         self.scanner = Scanner(part)
 
-    def at_distance(self, distance_mm: float, number: int) -> Disturbed:
-        rng = self._rng(0, number)
-        return self._scan(rng, self._pose(rng, distance_mm=distance_mm), distance_mm=distance_mm)
+    def series(self, views: int) -> list[Series]:
+        """All kinds of disturbance, with so many scans at each strength."""
+        stock_mm = (0.0, 0.25, 0.5, 0.75, 1.0)
+        distances_mm = (300.0, 350.0, 400.0, 450.0, 500.0, 600.0, 800.0, 1000.0)
+        angles_deg = tuple(float(angle) for angle in range(0, 360, 10))
+        saturated = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
+        chips, clamps = (0.0, 10.0, 20.0, 40.0, 80.0), (0.0, 1.0, 2.0, 3.0, 4.0)
+        noise_px = (0.0, 0.02, 0.05, 0.1, 0.2)
+        light, noise = "% of the pixels saturated", "px of disparity"
+        table = (
+            ("distance", "Distance", "mm", distances_mm, self._at_distance),
+            ("angle", "Angle", "deg", angles_deg, self._at_angle),
+            ("light", "Strong light", light, saturated, self._in_light),
+            ("chips", "Chips and drops", "of each on the part", chips, self._among_chips),
+            ("fixture", "Table and clamps", "clamps", clamps, self._in_fixture),
+            ("casting", "Casting allowance", "mm", stock_mm, self._as_cast),
+            ("stock", "The same, stock estimated", "mm", stock_mm, self._as_cast),
+            ("noise", "Correlated noise", noise, noise_px, self._with_noise),
+        )
+        return [
+            Series(
+                *row,
+                views=1 if row[0] == "angle" else views,
+                max_allowance_mm=1.0 if row[0] == "stock" else 0.0,
+                paper=PAPER.get(row[0]),
+            )
+            for row in table
+        ]
 
-    def at_angle(self, azimuth_deg: float, number: int) -> Disturbed:
+    def _at_distance(self, distance_mm: float, number: int) -> Disturbed:
+        rng = self._rng(0, number)
+        return self.scan(rng, self._pose(rng, distance_mm=distance_mm), distance_mm=distance_mm)
+
+    def _at_angle(self, azimuth_deg: float, number: int) -> Disturbed:
         views = hemisphere_viewpoints(
             self.part.center,
             distance_mm=DISTANCE_MM,
             elevations_deg=(ELEVATION_DEG,),
             azimuths_deg=(azimuth_deg,),
         )
-        return self._scan(self._rng(1, number, round(azimuth_deg)), views.view(0))
+        return self.scan(self._rng(1, number, round(azimuth_deg)), views.view(0))
 
-    def in_light(self, percent: float, number: int) -> Disturbed:
+    def _in_light(self, percent: float, number: int) -> Disturbed:
         rng = self._rng(2, number)
         pose, sensor = self._pose(rng), self.sensor.sample(rng)
         bright = saturating(self.scanner, sensor, pose, percent / 100, seed=self.seed)
-        return self._scan(rng, pose, sensor=bright)
+        return self.scan(rng, pose, sensor=bright)
 
-    def among_chips(self, count: float, number: int) -> Disturbed:
+    def _among_chips(self, count: float, number: int) -> Disturbed:
         return self._cluttered(self._rng(3, number), Clutter(chips=int(count), drops=int(count)))
 
-    def in_fixture(self, count: float, number: int) -> Disturbed:
+    def _in_fixture(self, count: float, number: int) -> Disturbed:
         rng = self._rng(4, number)
         return self._cluttered(rng, Clutter(table=True, tilt_deg=3.0, clamps=int(count)))
 
-    def as_cast(self, allowance_mm: float, number: int) -> Disturbed:
+    def _as_cast(self, allowance_mm: float, number: int) -> Disturbed:
         rng = self._rng(5, number)
         pose = self._pose(rng)
         casting = InvestmentCasting(
             allowance_mm=allowance_mm / 2, waviness_mm=allowance_mm / 6, wavelength_mm=30.0
         )
-        return self._scan(rng, pose, scanner=Scanner(as_cast(self.part, casting, rng)))
+        return self.scan(rng, pose, scanner=Scanner(as_cast(self.part, casting, rng)))
 
-    def with_noise(self, pixels: float, number: int) -> Disturbed:
+    def _with_noise(self, pixels: float, number: int) -> Disturbed:
         rng = self._rng(6, number)
         pose, sensor = self._pose(rng), self.sensor.sample(rng)
         noisy = dataclasses.replace(sensor, correlated_px=pixels, correlation_px=40.0)
-        return self._scan(rng, pose, sensor=noisy)
+        return self.scan(rng, pose, sensor=noisy)
 
     def _rng(self, *numbers: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, *numbers])
@@ -172,7 +170,7 @@ class _Stand:
         clutter = scene.owner(measured.face)[part] > 0
         return Disturbed(points[part], pose.inverse(), measured, float(clutter.mean()))
 
-    def _scan(
+    def scan(
         self,
         rng: np.random.Generator,
         pose: RigidTransform,
@@ -181,6 +179,7 @@ class _Stand:
         scanner: Scanner | None = None,
         distance_mm: float = DISTANCE_MM,
     ) -> Disturbed:
+        """Without a ``sensor`` by another camera of the kind, exposed for the distance."""
         sensor = sensor or self.sensor.sample(rng).exposed_for(distance_mm)
         measured = measure(scanner or self.scanner, sensor, pose, rng)
         return Disturbed(measured.points.astype(np.float64), pose.inverse(), measured, 0.0)

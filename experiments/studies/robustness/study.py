@@ -27,7 +27,7 @@ from experiments.runner import study_command as study
 from experiments.runner.vane_views import magnitudes, perturb, pose_error
 from experiments.studies.density.study import fit
 from experiments.studies.robustness import report as robustness_report
-from experiments.studies.robustness.disturbances import SENSOR, Disturbed, Series, make_series
+from experiments.studies.robustness.disturbances import SENSOR, Disturbed, Series, Stand
 from experiments.studies.verdicts.report import verdict_counts
 from vanejax.cad import Part, guide_vane
 from vanejax.errors import InputError
@@ -37,7 +37,6 @@ from vanejax.localization.pose_batch import select, stack
 from vanejax.plotting import save_figure
 from vanejax.pointcloud import voxel_thin
 from vanejax.rigid import RigidTransform
-from vanejax.scanner import Scanner, measure, preset
 from vanejax.scans import MeasuredScan
 from vanejax.training import TrainedMatcher, find_weights
 from vanejax.training.online_scans import RandomViews
@@ -118,33 +117,32 @@ def run_series(trial: Trial, series: Series, seed: int) -> dict[str, Any]:
         "name": series.name,
         "title": series.title,
         "unit": series.unit,
-        "paper": series.paper and dict(zip(("rmse_mm", "ffmde_abs_mm"), series.paper, strict=True)),
+        "paper": series.paper,
         "steps": steps,
     }
 
 
 def run_random(part: Part, matcher: TrainedMatcher, count: int, seed: int) -> dict[str, Any]:
     """Scans from anywhere by any camera of the kind, through the product's own path."""
-    scanner, kind, views = Scanner(part), preset(SENSOR), RandomViews()
+    stand, views = Stand(part, seed), RandomViews()
     rows = []
     for number in tqdm(range(count), "random scans", unit="scan"):
         rng = np.random.default_rng([seed, _RANDOM, number])
         pose = views.draw(rng, part.center)
         distance = float(np.linalg.norm(pose.apply(part.center[None])))
-        measured = measure(scanner, kind.sample(rng).exposed_for(distance), pose, rng)
-        truth = pose.inverse()
-        init = _rough(truth, part, rng)
-        scan = MeasuredScan(measured.points.astype(np.float64), None, np.zeros(3))
+        scan = stand.scan(rng, pose, distance_mm=distance)
+        init = _rough(scan.part_from_camera, part, rng)
+        cloud = MeasuredScan(scan.points, None, np.zeros(3))
         began = time.perf_counter()
-        result = register(scan, part, init=init, weights=matcher, seed=seed)
+        result = register(cloud, part, init=init, weights=matcher, seed=seed)
         seconds = time.perf_counter() - began
-        errors = _pose_errors(result.part_from_camera, truth, part)
+        errors = _pose_errors(result.part_from_camera, scan.part_from_camera, part)
         right = errors["rotation_deg"] < RIGHT_DEG and errors["translation_mm"] < RIGHT_MM
         rows.append(
             {
                 "number": number,
                 "distance_mm": distance,
-                "hole_share": measured.hole_share,
+                "hole_share": scan.measured.hole_share,
                 "points": len(scan.points),
                 **errors,
                 "right": right,
@@ -203,7 +201,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     part = guide_vane()
     networks = {name: find_weights(path, part) for name, path in files.items()}
     trial = Trial(part, networks)
-    series = make_series(part, views=settings.views, seed=settings.seed)
+    series = Stand(part, settings.seed).series(settings.views)
     report = study.header("RPM-Net, then ray casting", settings, part) | {
         "networks": {name: dict(matcher.trained) for name, matcher in networks.items()},
         "sensor": SENSOR,

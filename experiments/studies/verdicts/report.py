@@ -33,21 +33,20 @@ FIGURES = {
 NEGATIVE = ("violation_share", "unmeasured_share")
 
 
-def roc(right: np.ndarray, wrong: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """False and true accept rates [T] over all thresholds, from accepting nothing to everything.
+def roc(right: np.ndarray, wrong: np.ndarray) -> np.ndarray:
+    """False and true accept rates [2, T] over all thresholds, from accepting nothing to everything.
 
     Args:
       right, wrong: [n], [m] a figure of right and of wrong poses; larger is better.
     """
     thresholds = np.unique(np.concatenate([right, wrong]))[::-1]
     rates = [(0.0, 0.0), *((np.mean(wrong >= t), np.mean(right >= t)) for t in thresholds)]
-    false_accepts, true_accepts = np.array(rates).T
-    return false_accepts, true_accepts
+    return np.array(rates).T
 
 
 def _corners(right: np.ndarray, wrong: np.ndarray) -> list[list[float]]:
     """The curve of `roc` by its corners alone: false accepts, true accepts."""
-    rates = np.stack(roc(right, wrong), axis=1)
+    rates = roc(right, wrong).T
     steps = np.diff(rates, axis=0)
     turn = steps[:-1, 0] * steps[1:, 1] != steps[:-1, 1] * steps[1:, 0]
     return rates[np.concatenate([[True], turn, [True]])].round(4).T.tolist()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.studies.robustness import disturbances
-from experiments.studies.robustness.disturbances import Disturbed, Series, make_series, saturating
+from experiments.studies.robustness.disturbances import Disturbed, Series, Stand, saturating
 from vanejax.cad.parametric_vane import guide_vane
 from vanejax.localization.pose_batch import stack
 from vanejax.localization.residuals import RayCasting, measurement_model
@@ -26,7 +26,7 @@ def model() -> RayCasting:
 
 @pytest.fixture(scope="module")
 def series(model) -> dict[str, Series]:
-    return {one.name: one for one in make_series(model.part, views=2, seed=3)}
+    return {one.name: one for one in Stand(model.part, seed=3).series(views=2)}
 
 
 def deviations(model: RayCasting, scan: Disturbed) -> np.ndarray:

@@ -13,7 +13,7 @@ import pytest
 from experiments.runner.vane_views import perturb
 from experiments.studies.robustness import report as robustness_report
 from experiments.studies.robustness import study as robustness
-from experiments.studies.robustness.disturbances import make_series
+from experiments.studies.robustness.disturbances import Stand
 from experiments.studies.robustness.study import (
     Trial,
     make_parser,
@@ -151,7 +151,7 @@ def trial(monkeypatch) -> Trial:
 
 @pytest.mark.slow
 def test_a_series_is_refined_and_stock_is_found_where_it_says_so(trial):
-    every = {one.name: one for one in make_series(trial.part, views=3, seed=0)}
+    every = {one.name: one for one in Stand(trial.part, seed=0).series(views=3)}
     found = {}
     for name in ("casting", "stock"):
         report = run_series(trial, dataclasses.replace(every[name], values=(1.0,)), seed=0)
@@ -173,7 +173,7 @@ def test_a_series_is_refined_and_stock_is_found_where_it_says_so(trial):
 
 
 def test_refinement_is_what_the_table_says_it_is(trial):
-    series = {one.name: one for one in make_series(trial.part, views=1, seed=0)}["noise"]
+    series = {one.name: one for one in Stand(trial.part, seed=0).series(views=1)}["noise"]
     report = run_series(trial, dataclasses.replace(series, values=(0.0,)), seed=0)
     (row,) = report["steps"][0]["rows"]
     fine = row["guess"]["refined"]
