@@ -82,11 +82,8 @@ class DcpLoss(Settings):
         return sum(getattr(self, name) * value for name, value in parts.items()), parts
 
     def __call__(self, model: Dcp, variables: Any, pairs: Pair) -> tuple[jax.Array, Metrics]:
-        """Mean loss [] over a batch that shares its target, and mean metrics [].
-
-        Metrics: each part of the loss and the pose error.
-        """
-        # Once for the batch: the reference is the same for every view.
+        """Mean loss [] of a batch, its mean parts [] and pose error."""
+        # once for the batch: the reference is the same for every view
         embedding = model.apply(variables, pairs.target, method="embed")
 
         def of_pair(shared: tuple[Any, Embedding], pair: Pair) -> tuple[jax.Array, Metrics]:
@@ -115,10 +112,7 @@ class _IterationsLoss(Settings):
     def __call__(
         self, model: PointNetLK | PcrNet, variables: Variables, pairs: Pair
     ) -> tuple[jax.Array, Metrics]:
-        """Mean loss [] over a batch that shares its target, and mean metrics [].
-
-        Metrics: each part of the loss and the pose error, all after the last iteration.
-        """
+        """Mean loss [] of a batch; its mean parts [] and pose error after the last iteration."""
         # once for the batch: PointNetLK's takes seven passes of the encoder and a pseudo-inverse
         template = model.apply(variables, pairs.target, method="template")
         last = jnp.arange(self.iterations - 1.0, -1.0, -1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import operator
 import os
 from pathlib import Path
@@ -15,7 +16,7 @@ from vanejax.errors import InputError
 from vanejax.training.train_step import TrainState, Variables
 
 
-class Checkpoints:
+class Checkpoints(contextlib.AbstractContextManager):
     """The checkpoints in a folder; each is written whole or not at all (orbax renames it).
 
     Kept are the ``keep`` latest and the one with the lowest ``score``. Use as a context manager.
@@ -34,9 +35,6 @@ class Checkpoints:
             enable_async_checkpointing=False,
         )
         self._manager = ocp.CheckpointManager(Path(folder).absolute(), options=options)
-
-    def __enter__(self) -> Checkpoints:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._manager.close()

@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -173,34 +172,24 @@ def load_scan_set(
     Raises:
       InputError: no such file, not a scan set, another version, truncated, changed, or stale.
     """
-    path = Path(path)
     arrays, header = read_versioned_arrays(
         path, FORMAT, VERSION, words="a scan set", remedy="delete it and scan again"
     )
     if missing := {"radius_mm", "source", "sha256"} - set(header):
         raise InputError(f"{path}: its header has no {', '.join(sorted(missing))}")
+    source = header["source"]
     for key, value in (expected or {}).items():
-        if header["source"].get(key) != value:
+        if source.get(key) != value:
             raise InputError(
-                f"{path}: stale: made with {key} = {header['source'].get(key)}, wanted {value}; "
+                f"{path}: stale: made with {key} = {source.get(key)}, wanted {value}; "
                 "delete it or choose another folder"
             )
-    return _from_arrays(arrays, header, path)
-
-
-def _from_arrays(arrays: dict[str, np.ndarray], header: dict[str, Any], path: Path) -> ScanSet:
     try:
-        viewpoints = Viewpoints(
-            elevation_deg=arrays["elevation_deg"],
-            azimuth_deg=arrays["azimuth_deg"],
-            camera_from_part=RigidTransform.from_matrix(arrays["camera_from_part"]),
-        )
-        scans = ScanSet(
-            **{name: arrays[name] for name in _ARRAYS},
-            viewpoints=viewpoints,
-            radius_mm=float(header["radius_mm"]),
-            source=header["source"],
-        )
+        poses = RigidTransform.from_matrix(arrays["camera_from_part"])
+        viewpoints = Viewpoints(arrays["elevation_deg"], arrays["azimuth_deg"], poses)
+        own = {name: arrays[name] for name in _ARRAYS}
+        radius_mm = float(header["radius_mm"])
+        scans = ScanSet(**own, viewpoints=viewpoints, radius_mm=radius_mm, source=source)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(f"{path}: not a whole scan set ({error})") from error
     views = len(scans.counts)

@@ -2,8 +2,7 @@
 
 Scan number n is made from ``default_rng([seed, n])`` alone: viewpoint, distance, roll, sensor and
 casting. Step s takes the scans ``B s`` to ``B s + B - 1``, so that a run can begin at any step and
-see what an unbroken one sees. Worker threads scan ahead of the training, which never waits as long
-as they are faster than it is (tens of milliseconds for a scan of 320 x 256 pixels).
+see what an unbroken one sees. Worker threads scan ahead of the training.
 """
 
 from __future__ import annotations
@@ -49,9 +48,7 @@ class RandomViews(Settings):
     """
 
     distance_mm: tuple[float, float] = bounded(
-        (300.0, 500.0),
-        lambda ends: 0 < ends[0] <= ends[1] < np.inf,
-        "be (least, most), in mm",
+        (300.0, 500.0), lambda ends: 0 < ends[0] <= ends[1] < np.inf, "be (least, most), in mm"
     )
     elevation_deg: tuple[float, float] = bounded(
         (40.0, 90.0),
@@ -103,13 +100,22 @@ class OnlineScans(RandomViews):
             preset(self.sensor)
 
     def make_parts(self, part: Part, seed: int) -> list[Part]:
-        """The parts that are scanned: the CAD model, or castings of it."""
-        if not self.casting_mm:
-            return [part]
-        return [
-            as_cast(part, random_casting(rng, self.casting_mm), rng)
-            for rng in (np.random.default_rng([seed, _CASTINGS, k]) for k in range(self.castings))
-        ]
+        """The parts that are scanned: the CAD model, or castings of it.
+
+        They have stock of up to ``casting_mm``; waves (one deviation) and a bow of up to a fifth of
+        it.
+        """
+        parts, most_mm = [], self.casting_mm
+        for number in range(self.castings if most_mm else 0):
+            rng = np.random.default_rng([seed, _CASTINGS, number])
+            casting = InvestmentCasting(
+                allowance_mm=rng.uniform(0, most_mm),
+                waviness_mm=rng.uniform(0, most_mm / 5),
+                wavelength_mm=rng.uniform(20, 60),
+                bow_mm=rng.uniform(0, most_mm / 5),
+            )
+            parts.append(as_cast(part, casting, rng))
+        return parts or [part]
 
     def stream(
         self, part: Part, scans: ScanSet, sampling: PairSampling, *, batch_size: int, seed: int
@@ -129,16 +135,6 @@ class OnlineScans(RandomViews):
             voxel_mm=float(scans.source["voxel_mm"]),
             seed=seed,
         )
-
-
-def random_casting(rng: np.random.Generator, most_mm: float) -> InvestmentCasting:
-    """Stock of up to ``most_mm``; waves (one deviation) and a bow of up to a fifth of it."""
-    return InvestmentCasting(
-        allowance_mm=rng.uniform(0, most_mm),
-        waviness_mm=rng.uniform(0, most_mm / 5),
-        wavelength_mm=rng.uniform(20, 60),
-        bow_mm=rng.uniform(0, most_mm / 5),
-    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

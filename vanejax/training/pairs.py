@@ -21,12 +21,10 @@ from vanejax.training.dataset import ScanSet
 
 @flax.struct.dataclass
 class Pair:
-    """The unit of data: two clouds in unit-sphere units and the motion between them.
+    """The unit of data: two clouds in unit-sphere units and the motion between them, the label.
 
-    Attributes:
-      source: [N] the scan, moved away from the part.
-      target: [M] the reference, sampled from the CAD part.
-      target_from_source: the label.
+    The source [N] is the scan, moved away from the part; the target [M] is the reference, sampled
+    from the CAD part.
     """
 
     source: PointCloud

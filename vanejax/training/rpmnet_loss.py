@@ -57,13 +57,8 @@ def matching_loss(
     """Cross-entropy of the log assignment's rows against the true correspondences.
 
     A virtual scan knows where each of its points lies on the part: the wanted row is
-    ``softmax(-d^2 / (2 sigma^2))`` over the true distances ``d`` to the reference points.
-
-    Args:
-      sigma: width of the wanted rows, unit-sphere units; about the spacing of the reference.
-
-    Returns:
-      [] f32, mean over source points.
+    ``softmax(-d^2 / (2 sigma^2))`` over the true distances ``d`` to the reference points. ``sigma``
+    is in unit-sphere units, about the spacing of the reference. [] f32, mean over source points.
     """
     distances = squared_distances(target_from_source.apply(source.xyz), target.xyz)
     logits = jnp.where(target.mask[None, :], -distances / (2 * sigma**2), -1e9)
@@ -126,11 +121,8 @@ class RpmNetLoss(Settings):
     def __call__(
         self, model: RpmNet, variables: Variables, pairs: Pair
     ) -> tuple[jax.Array, Metrics]:
-        """Mean loss [] over a batch that shares its target, and mean metrics [].
-
-        Metrics: each part of the loss and the pose error, all after the last iteration.
-        """
-        # Once for the batch: the reference is the same for every view.
+        """Mean loss [] of a batch; its mean parts [] and pose error after the last iteration."""
+        # once for the batch: the reference is the same for every view
         features = fast_rpmnet.features(model, variables, pairs.target)
         weights = self.discount ** jnp.arange(self.iterations - 1.0, -1.0, -1.0)
 

@@ -7,7 +7,7 @@ bit-equal to an unbroken one and there is nothing to resume but the state.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import flax.linen as nn
 import flax.struct
@@ -24,6 +24,9 @@ from vanejax.training.shape_pairs import ShapeBank
 Metrics = dict[str, jax.Array]
 Variables = Any
 Bank = ScanBank | ShapeBank  # what pairs are drawn from
+# ``loss(model, variables, pairs)`` of sources [B] that share one target: mean loss [], and mean
+# metrics [], among them ``rotation_error_deg`` and ``translation_error``
+Loss = Callable[[nn.Module, Variables, Pair], tuple[jax.Array, Metrics]]
 
 
 @flax.struct.dataclass
@@ -41,18 +44,6 @@ class TrainState:
     variables: Variables
     average: Variables
     opt_state: optax.OptState
-
-
-class Loss(Protocol):
-    """What a network is trained to make small."""
-
-    def __call__(
-        self, model: nn.Module, variables: Variables, pairs: Pair
-    ) -> tuple[jax.Array, Metrics]:
-        """Mean loss [] over a batch of sources [B] that share one target, and mean metrics [].
-
-        The metrics hold ``rotation_error_deg`` and ``translation_error``.
-        """
 
 
 @settings_class
