@@ -1,4 +1,4 @@
-"""Drawing pairs: labels, poses, noise, subsets and padding, on a scan set made by hand."""
+"""Drawing pairs: labels, poses, noise, subsets, crops and padding, on scans and shapes by hand."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Viewpoints
 from vanejax.training.dataset import ScanSet
 from vanejax.training.pairs import (
+    Pair,
     PairSampling,
     draw_pairs,
     draw_pose,
@@ -26,14 +27,21 @@ from vanejax.training.pairs import (
     make_bank,
     source_sizes,
 )
+from vanejax.training.shape_pairs import ShapeBank, crop
 
 COUNTS = np.array([60, 45, 30, 10])
 NUM_REFERENCE, SURFACE = 64, 100
 CENTER, RADIUS_MM = np.array([3.0, -7.0, 40.0]), 50.0
 CLEAN = PairSampling(num_reference=NUM_REFERENCE, num_source=40, noise=0.0)
 VIEWS = jnp.array([2, 0, 3, 1, 0])
+POINTS, WHOLE, ROWS, BATCH = 200, 100, 70, 3  # of shapes
+CLEAN_SHAPES = PairSampling(
+    num_reference=WHOLE, num_source=8, noise=0.0, max_rotation_deg=20.0, max_translation=0.1
+)
 
 draw = jax.jit(draw_pairs, static_argnames="sampling")
+# what training calls: B entries in, B sources of the first entry's shape out
+draw_shapes = jax.jit(ShapeBank.draw, static_argnums=3)
 
 
 def surface(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -78,6 +86,37 @@ def bank():
 @functools.cache
 def pairs(sampling: PairSampling = CLEAN, seed: int = 0):
     return jax.tree.map(np.asarray, draw(jax.random.key(seed), bank(), VIEWS, sampling))
+
+
+@functools.cache
+def shapes() -> ShapeBank:
+    """Three ellipsoids."""
+    normals = np.random.default_rng(0).normal(size=(3, POINTS, 3))
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    sides = np.array([[1.0, 0.6, 0.3], [0.2, 1.0, 0.9], [0.5, 0.5, 1.0]])
+    points = normals * sides[:, None]
+    return ShapeBank(jnp.asarray(points, jnp.float32), jnp.asarray(normals, jnp.float32))
+
+
+def shape_pairs(index: int = 1, sampling: PairSampling = CLEAN_SHAPES, seed: int = 0) -> Pair:
+    entries = jnp.array([index, 0, 2])
+    return jax.tree.map(np.asarray, draw_shapes(shapes(), jax.random.key(seed), entries, sampling))
+
+
+def in_target_frame(pair: Pair) -> list[PointCloud]:
+    """The real points of every source, put back by its label."""
+    found = []
+    for index, mask in enumerate(pair.source.mask):
+        label, source = jax.tree.map(
+            lambda leaf, index=index: leaf[index], (pair.target_from_source, pair.source)
+        )
+        found.append(jax.tree.map(lambda leaf, mask=mask: leaf[mask], source.transform(label)))
+    return found
+
+
+def clouds_of(pair: Pair) -> list[np.ndarray]:
+    """The points of the target and of every source, in the target's frame."""
+    return [pair.target.xyz, *(source.xyz for source in in_target_frame(pair))]
 
 
 def rows_of(points: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -194,25 +233,19 @@ def test_noise_has_its_width_and_its_clip():
     assert abs(np.corrcoef(noise[:, 0], other[:, 0])[0, 1]) < 5 / np.sqrt(20_000)
 
 
-def test_both_clouds_of_a_pair_are_noisy_and_the_label_is_not():
+@pytest.mark.parametrize(("drawn", "clean"), [(pairs, CLEAN), (shape_pairs, CLEAN_SHAPES)])
+def test_both_clouds_of_a_pair_are_noisy_and_the_label_is_not(drawn, clean: PairSampling):
     """The noise is all that separates a noisy pair from the clean one of the same key."""
-    noisy = pairs(dataclasses.replace(CLEAN, noise=0.01))
-    clean = pairs()
-    jax.tree.map(np.testing.assert_array_equal, noisy.target_from_source, clean.target_from_source)
-    np.testing.assert_array_equal(noisy.source.normals, clean.source.normals)
-    gaps = [noisy.target.xyz - clean.target.xyz]
-    for index in range(len(VIEWS)):
-        label = jax.tree.map(lambda leaf, index=index: leaf[index], clean.target_from_source)
-        mask = clean.source.mask[index]
-        gap = label.rotate(noisy.source.xyz[index] - clean.source.xyz[index])
-        gaps.append(gap[mask])
-        np.testing.assert_array_equal(noisy.source.xyz[index][~mask], 0)
-    for gap in gaps:
+    noisy, still = drawn(sampling=dataclasses.replace(clean, noise=0.01)), drawn()
+    jax.tree.map(np.testing.assert_array_equal, noisy.target_from_source, still.target_from_source)
+    np.testing.assert_array_equal(noisy.source.normals, still.source.normals)
+    np.testing.assert_array_equal(noisy.source.xyz[~noisy.source.mask], 0)
+    gaps = [a - b for a, b in zip(clouds_of(noisy), clouds_of(still), strict=True)]
+    for index, gap in enumerate(gaps):
         np.testing.assert_allclose(gap.std(), 0.01, rtol=5 / np.sqrt(2 * gap.size))
-    # two views and the target do not share their noise
-    for a, b in ((gaps[0], gaps[2]), (gaps[2], gaps[5])):
-        rows = min(len(a), len(b))
-        assert np.abs(a[:rows] - b[:rows]).max() > 0.01
+        for other in gaps[:index]:  # no two share their noise
+            rows = min(len(gap), len(other))
+            assert np.abs(gap[:rows] - other[:rows]).max() > 0.01
 
 
 def test_every_real_point_is_drawn_equally_often():
@@ -233,3 +266,113 @@ def test_a_source_never_has_more_points_than_its_scan():
     subset = draw_subset(jax.random.key(0), cloud, jnp.asarray(30), 40)
     assert subset.mask.tolist() == [True] * 10 + [False] * 30
     np.testing.assert_array_equal(subset.xyz[10:], 0)
+
+
+# ---- shapes ----
+
+
+@pytest.mark.parametrize("index", [0, 2])
+def test_without_noise_the_label_puts_every_source_point_on_the_shape(index: int):
+    drawn = shape_pairs(index)
+    shape, normals = np.asarray(shapes().points[index]), np.asarray(shapes().normals[index])
+    assert drawn.source.xyz.shape == (BATCH, ROWS, 3)
+    assert drawn.source.mask.all()
+    angles = np.degrees(rotation_angle(drawn.target_from_source.rotation))
+    assert 5 < angles.max() <= 20 + 1e-4  # f32 eps x 1000
+    for moved, source in zip(drawn.source.xyz, in_target_frame(drawn), strict=True):
+        rows = rows_of(source.xyz, shape)
+        assert rows.min() >= 0
+        assert len(set(rows.tolist())) == ROWS  # drawn without replacement
+        np.testing.assert_allclose(source.normals, normals[rows], atol=2e-6)  # f32 eps x 20
+        assert (rows_of(moved, shape) < 0).all()  # moved away first
+    rows = rows_of(drawn.target.xyz, shape)
+    assert drawn.target.xyz.shape == (ROWS, 3)
+    assert rows.min() >= 0
+    assert len(set(rows.tolist())) == ROWS
+    np.testing.assert_array_equal(drawn.target.normals, normals[rows])
+
+
+def test_clouds_are_drawn_and_cropped_apart():
+    """Each cloud holds half of the shape's points, of its own choice, and loses a side of its own.
+
+    One plane for two clouds would leave their means 0.1 apart, the noise of 70 points; planes of
+    their own leave 0.3.
+    """
+    drawn = shape_pairs()
+    shape = np.asarray(shapes().points[1])
+    kept = [set(rows_of(cloud, shape).tolist()) for cloud in clouds_of(drawn)]
+    for i, one in enumerate(kept):
+        for other in kept[:i]:
+            assert len(one & other) < 0.75 * ROWS
+    means = [
+        [cloud.mean(axis=0) for cloud in clouds_of(shape_pairs(seed=seed))] for seed in range(20)
+    ]
+    means = np.array(means)
+    assert np.ptp(means, axis=0).min() > 0.1  # other keys, other clouds
+    for i in range(BATCH + 1):
+        for other in range(i):
+            gaps = np.linalg.norm(means[:, i] - means[:, other], axis=1)
+            assert gaps.mean() > 0.2
+
+
+def test_a_crop_is_a_cut_by_a_plane_that_keeps_the_share():
+    """Oracle: sorted heights along the one direction that the key stands for."""
+    cloud = PointCloud.create(shapes().points[0], shapes().normals[0])
+    key = jax.random.key(3)
+    kept = crop(key, cloud, 140)
+    heights = np.asarray(cloud.xyz) @ np.asarray(jax.random.normal(key, (3,)))
+    expected = np.argsort(-heights)[:140]
+    assert kept.mask.all()
+    rows = rows_of(np.asarray(kept.xyz), np.asarray(cloud.xyz))
+    assert rows.tolist() == sorted(expected.tolist())  # in the cloud's order
+
+
+def test_crop_directions_are_uniform():
+    """The kept part's mean points anywhere: the mean over many keys is near zero."""
+    normals = np.random.default_rng(5).normal(size=(POINTS, 3))
+    sphere = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    sphere = jnp.asarray(np.concatenate([sphere, -sphere]), jnp.float32)  # its mean is the origin
+    cloud = PointCloud.create(sphere, sphere)
+    keys = jax.random.split(jax.random.key(0), 1000)
+    means = jax.vmap(lambda key: crop(key, cloud, 280).xyz.mean(axis=0))(keys)
+    # 70 % of a sphere has its mean at 0.3; each coordinate has a deviation of 0.3 / sqrt(3)
+    np.testing.assert_allclose(np.linalg.norm(means, axis=1).mean(), 0.3, atol=0.03)
+    np.testing.assert_allclose(np.mean(means, axis=0), 0, atol=5 * 0.3 / np.sqrt(3 * 1000))
+    np.testing.assert_allclose(np.std(means, axis=0), 0.3 / np.sqrt(3), rtol=0.15)
+
+
+def test_padding_is_cropped_first():
+    cloud = PointCloud.create(shapes().points[0], shapes().normals[0])
+    cloud = cloud.replace(mask=jnp.arange(POINTS) < 100, xyz=cloud.xyz.at[100:].set(99.0))
+    kept = crop(jax.random.key(0), cloud, 70)
+    assert kept.mask.all()
+    assert np.abs(kept.xyz).max() <= 1
+    assert crop(jax.random.key(0), cloud, 120).mask.tolist() == [True] * 100 + [False] * 20
+
+
+def test_order_says_nothing():
+    """Rows come in random order, not sorted by height along the crop's direction."""
+    cloud = shape_pairs(0).target.xyz
+    centred = cloud - cloud.mean(axis=0)
+    places = np.linspace(-1, 1, ROWS)
+    # a sorted crop correlates by about 0.95 with its direction
+    correlation = np.abs(places @ centred) / np.linalg.norm(places)
+    assert np.max(correlation / np.linalg.norm(centred, axis=0)) < 0.5
+
+
+def test_published_sizes():
+    """Nothing is compiled."""
+
+    def drawn(held: int) -> Pair:
+        empty = ShapeBank(jnp.zeros((1, held, 3)), jnp.zeros((1, held, 3)))
+        entries = jnp.zeros(BATCH, jnp.int32)
+        return jax.eval_shape(lambda: empty.draw(jax.random.key(0), entries, PairSampling()))
+
+    pair = drawn(1024)
+    assert pair.source.xyz.shape == (BATCH, 717, 3)
+    assert pair.source.mask.shape == (BATCH, 717)
+    assert pair.target.xyz.shape == (717, 3)
+    assert pair.target_from_source.rotation.shape == (BATCH, 3, 3)
+    with pytest.raises(InputError, match="1023 points each, 1024 are wanted"):
+        drawn(1023)
+    assert shapes().size == 3
