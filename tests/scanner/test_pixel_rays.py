@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from vanejax.scanner import Camera, look_at
-from vanejax.scanner.image_window import Window
-from vanejax.scanner.pixel_rays import MeasuredPixels, PixelRays
+from vanejax.scanner.pixel_rays import PixelRays
 
 CAMERA = Camera(width=320, height=256, near_mm=100)
 POSE = look_at(400 * np.array([0.43301, 0.25, 0.86603]), np.array([3.0, -2.0, 1.0]))
-WINDOW = Window(slice(20, 50), slice(7, 107))
 
 
 def view(*, backs: bool = False) -> PixelRays:
@@ -68,33 +66,3 @@ def test_edge_on_means_a_cosine_below_one_thousandth(side, backs):
     clear = np.abs(cosine - 1e-3) > 1e-9
     expected = (cosine > 1e-3) & (backs or side == 1)
     np.testing.assert_array_equal(measured[clear], expected[clear])
-
-
-def test_what_is_not_measured_is_left_out_and_no_memory_is_kept():
-    seen = view()
-    eye = POSE.inverse().translation
-    row, column = np.array([3, 3, 9, 200], np.int32), np.array([5, 6, 0, 319], np.int32)
-    towards = POSE.inverse().rotate(CAMERA.ray_directions(column, row))
-    ranges = np.array([200.0, 50.0, 300.0, 400.0])  # the second is before the near plane
-    local = planes_through(eye + ranges[:, None] * towards, -towards)
-    measured = MeasuredPixels(1000)
-    for some in (slice(0, 3), slice(3, 4)):
-        measured.add(
-            seen,
-            row[some],
-            column[some],
-            np.arange(10, 14, dtype=np.int32)[some],
-            seen.facing(local[some]),
-        )
-    measured.cut()
-    kept = [0, 2, 3]
-    np.testing.assert_array_equal(measured.face, [10, 12, 13])
-    np.testing.assert_array_equal(measured.pixel, [3 * 320 + 5, 9 * 320, 200 * 320 + 319])
-    expected = ranges[:, None] * CAMERA.ray_directions(column, row)
-    np.testing.assert_allclose(measured.points, expected[kept], rtol=1e-6)  # f32
-    np.testing.assert_allclose(
-        measured.normals, -CAMERA.ray_directions(column, row)[kept], atol=1e-7
-    )
-    for array in (measured.points, measured.normals, measured.face, measured.pixel):
-        assert array.flags.owndata
-        assert array.flags.c_contiguous

@@ -150,14 +150,14 @@ def test_drops_sit_on_a_sphere_along_its_normal():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"clamps": -1}, {"chips": -3}, {"drops": -1}, {"tilt_deg": np.nan}]
+    ("make", "wrong"),
+    [
+        *[(Clutter, {name: -1}) for name in ("clamps", "chips", "drops")],
+        (Clutter, {"tilt_deg": np.nan}),
+        *[(table, {name: 0.0}) for name in ("size_mm", "thickness_mm")],
+        (table, {"tilt_deg": 90.0}),
+    ],
 )
-def test_clutter_that_cannot_be(wrong):
-    with pytest.raises(InputError, match="clutter"):
-        Clutter(**wrong)
-
-
-@pytest.mark.parametrize("wrong", [{"size_mm": 0.0}, {"thickness_mm": -1.0}, {"tilt_deg": 90.0}])
-def test_tables_that_cannot_be(wrong):
-    with pytest.raises(InputError, match="table"):
-        table(bracket(), **wrong)
+def test_clutter_that_cannot_be(make, wrong):
+    with pytest.raises(InputError, match=make.__name__.lower()):
+        make(**wrong) if make is Clutter else make(bracket(), **wrong)

@@ -56,29 +56,21 @@ def view():
 SENSOR = np.array([0.0, 0.0, 400.0])
 
 
-# degrees: without noise the curvature within a neighbourhood is all, in the plane nothing is
-@pytest.mark.parametrize(("surface", "limit"), [(plane, 0.001), (sphere, 0.8), (cylinder, 0.6)])
-def test_exact_surfaces(surface, limit):
-    points, normals = surface(20_000, np.random.default_rng(0))
-    found = estimate_normals(points, sensor_origin=SENSOR, num_neighbors=16)
-    assert found.dtype == np.float32
-    assert np.median(angle_deg(found, normals)) < limit
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-6)  # f32 eps x 8
-
-
 @pytest.mark.parametrize("surface", [plane, sphere, cylinder])
-@pytest.mark.parametrize("noise", [0.05, 0.3])
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.3])
 def test_noisy_surfaces(surface, noise):
     rng = np.random.default_rng(1)
     points, normals = surface(40_000, rng)
     at = rng.choice(len(points), 1000, replace=False)
     points = points + noise * rng.normal(size=(len(points), 1)) * normals
-    error = angle_deg(estimate_normals(points, sensor_origin=SENSOR, at=at), normals[at])
+    found = estimate_normals(points, sensor_origin=SENSOR, at=at)
+    assert found.dtype == np.float32
+    error = angle_deg(found, normals[at])
     # two axes of 1.25 deg at most, whose length has a median of 1.2 sigma; and some curvature
-    assert np.median(error) < 2.0
+    assert np.median(error) < (2.0 if noise else 0.6)  # without noise the curvature is all
     # its own estimate of that is honest: the median of a Rayleigh distribution is 1.18 sigma,
     # and the worst axis is no better than both
-    if surface is plane:
+    if surface is plane and noise:
         tilt_deg = quality(points, _enough_neighbors(cKDTree(points), points), at)[1]
         assert 0.6 < np.median(error) / (1.18 * np.median(tilt_deg)) < 1.1
 

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vanejax.errors import InputError
-from vanejax.scans.point_file import read_points
+from vanejax.scans.point_file import PointFile, read_points
 from vanejax.scans.scan_file import WRITTEN_SUFFIXES, load_scan, robust_extent, save_points
 
 REAL_SCANS = Path(__file__).parents[3] / "shared" / "data" / "real_scans"
@@ -120,6 +120,15 @@ def put(folder: Path, name: str, data: bytes) -> Path:
     return path
 
 
+def assert_holds(file: PointFile, points: np.ndarray, normals: np.ndarray | None = None) -> None:
+    assert np.array_equal(file.points, points)
+    assert file.points.dtype == np.float64
+    if normals is None:
+        assert file.normals is None
+    else:
+        assert np.array_equal(file.normals, normals.astype(np.float32))
+
+
 CORNERS = st.lists(st.tuples(*[st.floats(-1e5, 1e5, width=32)] * 6), min_size=1, max_size=20).map(
     lambda rows: np.array(rows, np.float64)
 )
@@ -138,13 +147,8 @@ def test_ply_of_every_form(tmp_path_factory, values, form, types, with_normals, 
     points, normals = values[:, :3], values[:, 3:] if with_normals else None
     data = ply(points, normals, form=form, types=types, extra=extra, faces=faces)
     file = read_points(put(tmp_path_factory.getbasetemp(), "any.ply", data))
-    assert np.array_equal(file.points, points)
+    assert_holds(file, points, normals)
     assert file.num_faces == faces
-    assert file.points.dtype == np.float64
-    if with_normals:
-        assert np.array_equal(file.normals, normals.astype(np.float32))
-    else:
-        assert file.normals is None
 
 
 @given(
@@ -158,12 +162,8 @@ def test_pcd_of_every_form(tmp_path_factory, values, form, kind, with_normals):
     points, normals = values[:, :3], values[:, 3:] if with_normals else None
     data = pcd(points, normals, form=form, kind=kind)
     file = read_points(put(tmp_path_factory.getbasetemp(), "any.pcd", data))
-    assert np.array_equal(file.points, points)
+    assert_holds(file, points, normals)
     assert file.format == "PCD, " + form.replace("_", " ")
-    if with_normals:
-        assert np.array_equal(file.normals, normals.astype(np.float32))
-    else:
-        assert file.normals is None
 
 
 @given(
@@ -180,8 +180,7 @@ def test_text_of_every_form(tmp_path_factory, values, apart, head, end, bom, suf
     data = table(points, normals, apart=apart, head=head.format(apart), end=end)
     data = b"\xef\xbb\xbf" * bom + data
     file = read_points(put(tmp_path_factory.getbasetemp(), "any" + suffix, data))
-    assert np.array_equal(file.points, points)
-    assert np.array_equal(file.normals, normals.astype(np.float32))
+    assert_holds(file, points, normals)
 
 
 @given(
@@ -200,25 +199,9 @@ def test_what_is_saved_is_read_back(tmp_path_factory, values, suffix, with_norma
     if suffix == ".xyz":  # no header: only unit vectors are normals
         normals = facing(points)
     path = tmp_path_factory.getbasetemp() / f"saved{suffix}"
-    save_points(path, points, normals if with_normals else None)
-    file = read_points(path)
-    assert np.array_equal(file.points, points)
-    if with_normals:
-        assert np.array_equal(file.normals, normals)
-    else:
-        assert file.normals is None
-
-
-@pytest.mark.parametrize("suffix", WRITTEN_SUFFIXES)
-def test_a_scan_survives_a_file(tmp_path, suffix):
-    points = sheet().astype(np.float32).astype(np.float64)
-    path = tmp_path / f"Scan 1{suffix}"
-    save_points(path, points, facing(points))
-    scan = load_scan(path)
-    assert scan.name == "Scan 1"
-    assert np.array_equal(scan.points, points)
-    np.testing.assert_allclose(scan.normals, facing(points), atol=2e-7)  # made unit once more
-    assert list(tmp_path.iterdir()) == [path]
+    normals = normals if with_normals else None
+    save_points(path, points, normals)
+    assert_holds(read_points(path), points, normals)
 
 
 def test_large_files_are_read_and_written_in_blocks(tmp_path, monkeypatch):
@@ -227,9 +210,7 @@ def test_large_files_are_read_and_written_in_blocks(tmp_path, monkeypatch):
     points = sheet(60)
     for suffix in (".ply", ".csv"):
         save_points(tmp_path / f"a{suffix}", points, facing(points))
-        file = read_points(tmp_path / f"a{suffix}")
-        assert np.array_equal(file.points, points)
-        assert np.array_equal(file.normals, facing(points))
+        assert_holds(read_points(tmp_path / f"a{suffix}"), points, facing(points))
 
 
 def test_an_organised_cloud_with_holes(tmp_path):
@@ -237,6 +218,7 @@ def test_an_organised_cloud_with_holes(tmp_path):
     points[::3] = np.nan
     path = put(tmp_path, "organised.pcd", pcd(points, form="binary_compressed", width=30))
     scan = load_scan(path)
+    assert scan.name == "organised"
     assert np.array_equal(scan.points, np.delete(points, np.arange(0, 300, 3), axis=0))
     assert "dropped 100 points without a measurement (not finite)" in scan.notes
     points[::3] = 0.0
@@ -258,26 +240,22 @@ def test_numpy_files(tmp_path):
     points, normals = sheet(), facing(sheet())
     for key in ("points", "xyz"):
         path = put(tmp_path, "a.npz", npz(**{key: points, "normals": normals, "other": "text"}))
-        file = read_points(path)
-        assert np.array_equal(file.points, points)
-        assert np.array_equal(file.normals, normals)
+        assert_holds(read_points(path), points, normals)
     np.save(tmp_path / "a.npy", points.astype(np.float32))
-    assert np.array_equal(read_points(tmp_path / "a.npy").points, points.astype(np.float32))
+    assert_holds(read_points(tmp_path / "a.npy"), points.astype(np.float32))
     both = np.asfortranarray(np.concatenate([points, normals], axis=1)).astype(">f8")
     np.save(tmp_path / "b.npy", both)
-    assert np.array_equal(read_points(tmp_path / "b.npy").normals, normals)
+    assert_holds(read_points(tmp_path / "b.npy"), points, normals)
     np.save(tmp_path / "c.npy", points.reshape(10, 20, 3))
-    assert np.array_equal(read_points(tmp_path / "c.npy").points, points)
+    assert_holds(read_points(tmp_path / "c.npy"), points)
 
 
 def test_text_without_names(tmp_path):
     points, normals = sheet(), facing(sheet())
-    named = read_points(put(tmp_path, "a.txt", table(points, normals)))
-    assert np.array_equal(named.normals, normals)
+    assert_holds(read_points(put(tmp_path, "a.txt", table(points, normals))), points, normals)
     colours = np.random.default_rng(0).integers(0, 255, points.shape)
     file = read_points(put(tmp_path, "b.txt", table(points, colours)))
-    assert np.array_equal(file.points, points)
-    assert file.normals is None
+    assert_holds(file, points)
     assert file.notes == ("columns 4 to 6 are no unit vectors (colours?) and were passed over",)
     pts = f"{len(points)}\n".encode() + table(np.concatenate([points, points[:, :1]], axis=1))
     file = read_points(put(tmp_path, "c.pts", pts))
