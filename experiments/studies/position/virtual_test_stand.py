@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -20,21 +21,20 @@ from vanejax.errors import InputError
 from vanejax.localization.residuals import RayCasting, measurement_model
 from vanejax.machine.calibration import Calibration, averaged, calibrate
 from vanejax.machine.calibration_cube import SIDE_MM, Cube, cube_faces, cube_of
+from vanejax.machine.positioning import in_machine
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.measurement import measure
-from vanejax.scanner.range_errors import Lens, Trueness
-from vanejax.scanner.sensor import Sensor
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Scanner, Sensor, measure
 from vanejax.scans.measured_scan import MeasuredScan
 
 PROBE_MM = 0.015  # of the paper's probe, taken as the standard deviation along each axis
 FLATNESS_MM = 0.02  # of the cube's faces, and how far they are from square over its side
 ASKEW_DEG, ASIDE_MM = 0.5, 1.0  # of the stage from its drawing, standard deviations
 AXIS_BESIDE_MM = 8.0  # from the R axis to the part's centre
-PLACEMENTS, TOUCHED = 8, 9  # of the cube, and points on each of its faces
+PLACEMENTS, TOUCHED = 8, 3  # of the cube, and points along each side of each of its faces
 TRIES = 10  # to place the cube so that all three faces are seen
 CUBE_TILT_DEG = 8.0
 MOVES_MM = (
+    (0.0, 0.0, 0.0),
     (20.0, 0.0, 0.0), (40.0, 0.0, 0.0), (-30.0, 0.0, 0.0),
     (0.0, 15.0, 0.0), (0.0, 25.0, 0.0), (0.0, -20.0, 0.0),
     (0.0, 0.0, 15.0), (0.0, 0.0, 30.0), (0.0, 0.0, -25.0),
@@ -98,11 +98,11 @@ class VirtualTestStand:
 
     def moved(self, stage: RigidTransform) -> RigidTransform:
         """The part's true motion in the camera's frame when the stage does ``stage`` in its own."""
-        return self.camera_from_stage @ stage @ self.camera_from_stage.inverse()
+        return in_machine(stage, self.camera_from_stage)
 
     def expected(self, stage: RigidTransform) -> RigidTransform:
         """The same by the drawing."""
-        return self.nominal_from_stage @ stage @ self.nominal_from_stage.inverse()
+        return in_machine(stage, self.nominal_from_stage)
 
     def truth(self, stage: RigidTransform) -> RigidTransform:
         """part_from_camera after the stage's motion."""
@@ -134,10 +134,9 @@ def stage_moves(positions: int) -> list[RigidTransform]:
     Raises:
       InputError: more positions than there are.
     """
-    if not 2 <= positions <= 1 + len(MOVES_MM):
-        raise InputError(f"positions must be from 2 to {1 + len(MOVES_MM)}, got {positions}")
-    shifts = np.concatenate([np.zeros((1, 3)), np.array(MOVES_MM)])[:positions]
-    return [RigidTransform(np.eye(3), shift) for shift in shifts]
+    if not 2 <= positions <= len(MOVES_MM):
+        raise InputError(f"positions must be from 2 to {len(MOVES_MM)}, got {positions}")
+    return [RigidTransform(np.eye(3), np.array(shift)) for shift in MOVES_MM[:positions]]
 
 
 # The cube.
@@ -158,15 +157,8 @@ class GroundCube:
     @classmethod
     def ground(cls, rng: np.random.Generator) -> GroundCube:
         """Faces within their flatness, square within theirs."""
-        waves = np.stack(
-            [
-                rng.uniform(50, 120, (3, 2)),
-                rng.uniform(0, np.pi, (3, 2)),
-                rng.uniform(0, 2 * np.pi, (3, 2)),
-                rng.uniform(0.3, 1, (3, 2)),
-            ],
-            axis=-1,
-        )
+        limits = ((50, 120), (0, np.pi), (0, 2 * np.pi), (0.3, 1))
+        waves = np.stack([rng.uniform(*limit, (3, 2)) for limit in limits], axis=-1)
         grid = np.stack(np.meshgrid(*2 * [np.linspace(-SIDE_MM, 0, 31)]), axis=-1).reshape(-1, 2)
         for face in waves:
             face[:, 3] *= FLATNESS_MM / np.ptp(_height(face, grid))
@@ -187,10 +179,9 @@ class GroundCube:
         flat = np.asarray(box.vertices) - SIDE_MM / 2
         vertices = flat.copy()
         for k in range(3):
+            height = _height(self.waves[k], np.delete(flat, k, axis=1))
             # fades towards the face on the other side, which nobody sees
-            vertices[:, k] += _height(self.waves[k], np.delete(flat, k, axis=1)) * (
-                1 + flat[:, k] / SIDE_MM
-            )
+            vertices[:, k] += height * (1 + flat[:, k] / SIDE_MM)
         return part_from_mesh(vertices @ self.lean.T, np.asarray(box.faces), name="cube")
 
 
@@ -201,27 +192,16 @@ def _height(waves: np.ndarray, places: np.ndarray) -> np.ndarray:
     return np.sin(2 * np.pi * along / length + phase) @ weight
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class PlacedCube:
+class PlacedCube(NamedTuple):
     """One placement of the cube, as both instruments have it.
 
     Attributes:
       scanned: three arrays [n, 3] mm, camera frame, of the scan's points on each face.
-      touched: three arrays [TOUCHED, 3] mm, machine frame.
+      touched: three arrays [9, 3] mm, machine frame.
     """
 
     scanned: list[np.ndarray]
     touched: list[np.ndarray]
-
-    @property
-    def touched_cube(self) -> Cube:
-        """As the machine has it."""
-        return cube_of(self.touched, noise_mm=PROBE_MM)
-
-    @property
-    def scanned_cube(self) -> Cube:
-        """As the camera has it."""
-        return cube_of(self.scanned)
 
 
 def place_cubes(stand: VirtualTestStand, rng: np.random.Generator) -> list[PlacedCube]:
@@ -238,6 +218,8 @@ def place_cubes(stand: VirtualTestStand, rng: np.random.Generator) -> list[Place
 def _placed(
     stand: VirtualTestStand, block: GroundCube, scanner: Scanner, rng: np.random.Generator
 ) -> PlacedCube:
+    steps = np.linspace(-0.9, -0.1, TOUCHED) * SIDE_MM
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     for _ in range(TRIES):
         camera_from_cube = _corner_up(rng)
         points = measure(scanner, stand.sensor, camera_from_cube, rng).points.astype(np.float64)
@@ -248,9 +230,7 @@ def _placed(
         machine_from_cube = stand.machine_from_camera @ camera_from_cube
         touched = []
         for k in range(3):
-            steps = np.linspace(-0.9, -0.1, round(np.sqrt(TOUCHED))) * SIDE_MM
-            places = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-            places = places + rng.uniform(-3, 3, places.shape)
+            places = grid + rng.uniform(-3, 3, grid.shape)
             exact = machine_from_cube.apply(block.on_face(k, places))
             touched.append(exact + PROBE_MM * rng.standard_normal(exact.shape))
         return PlacedCube([points[label == k] for k in range(3)], touched)
@@ -266,10 +246,15 @@ def _corner_up(rng: np.random.Generator) -> RigidTransform:
     return RigidTransform((tilt * spin * up).as_matrix(), corner)
 
 
+def touched_cubes(placed: list[PlacedCube]) -> list[Cube]:
+    """As the machine has them."""
+    return [cube_of(cube.touched, noise_mm=PROBE_MM) for cube in placed]
+
+
 def calibrations(placed: list[PlacedCube]) -> tuple[Calibration, Calibration]:
     """By all planes at once, and by the paper's mean."""
-    seen = [cube.scanned_cube for cube in placed]
-    touched = [cube.touched_cube for cube in placed]
+    seen = [cube_of(cube.scanned) for cube in placed]
+    touched = touched_cubes(placed)
     return calibrate(seen, touched), averaged(seen, touched)
 
 
@@ -279,20 +264,15 @@ def calibrations(placed: list[PlacedCube]) -> tuple[Calibration, Calibration]:
 def calibration_errors(kind: Sensor) -> list[Sensor]:
     """A kind of camera with one error of its calibration each, of one standard deviation.
 
-    Those that `Sensor.sample` draws.
+    Those that `Sensor.sample` draws of a lens and a trueness, a pair's two apart.
     """
     exact = dataclasses.replace(kind, lens=None, trueness=None)
-    errors: list[dict[str, Lens | Trueness]] = []
-    if kind.lens is not None:
-        for name in ("k1", "k2", "p1", "p2", "focal_error"):
-            errors.append({"lens": Lens(**{name: getattr(kind.lens, name)})})
-        for center in np.diag(kind.lens.center_error_px):
-            errors.append({"lens": Lens(center_error_px=tuple(center))})
-    if kind.trueness is not None:
-        errors.append({"trueness": Trueness(scale=kind.trueness.scale)})
-        for bend in np.diag(kind.trueness.bend_mm):
-            errors.append({"trueness": Trueness(bend_mm=tuple(bend))})
-    return [dataclasses.replace(exact, **error) for error in errors]
+    return [
+        dataclasses.replace(exact, **{name: type(errors)(**{field: one})})
+        for name, errors in (("lens", kind.lens), ("trueness", kind.trueness))
+        for field, value in dataclasses.asdict(errors).items()
+        for one in (map(tuple, np.diag(value)) if isinstance(value, tuple) else [value])
+    ]
 
 
 def shifts_mm(sensor: Sensor, points: np.ndarray) -> np.ndarray:
@@ -334,7 +314,7 @@ def pose_bias(
 
 def frame_bias(placed: list[PlacedCube], found: Calibration, errors: list[Sensor]) -> np.ndarray:
     """[6, K]: what the same errors do to machine_from_camera, about ``found.center``."""
-    touched = [cube.touched_cube for cube in placed]
+    touched = touched_cubes(placed)
     scanned = [
         [points[:: max(1, len(points) // 500)] for points in cube.scanned] for cube in placed
     ]

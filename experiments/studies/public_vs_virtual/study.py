@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from experiments.compare import figures, training_summary
 from experiments.evaluate import registered
+from experiments.runner import markdown
 from experiments.runner import study_command as study
 from experiments.runner.evaluation_report import hardest_views
 from experiments.runner.experiment import Experiment
@@ -31,6 +32,7 @@ from vanejax.matching.metrics import mean_per_axis, mean_per_view
 from vanejax.training.dataset import ScanSet
 
 PUBLIC, VIRTUAL = "public", "virtual"
+VIEWS = ("hardest", "all")
 PAPER_REDUCTION = 0.8  # "a combined reduction of approximately 80%"
 
 
@@ -80,17 +82,13 @@ def public_vs_virtual(
             source = read_json(shapes)
         sources[name] = source | {"training": training_summary(network)}
         results[name] = registered(settings, scans, network.variables, progress=progress)
-    report = {
-        "name": config.name,
-        **report_head(part, seed=config.seed, config=dataclasses.asdict(config)),
-        "trained_on": sources,
-    } | compared(results, scans.test)
+    head = report_head(part, seed=config.seed, config=dataclasses.asdict(config))
+    report = {"name": config.name, **head, "trained_on": sources, **compared(results, scans.test)}
     report = study.save(workdir, "public_vs_virtual", report)
-    for title, views in (("hardest", hardest_views(scans.test)), ("all", slice(None))):
+    for title, views in reported_views(scans.test).items():
         series = {
             sources[name]["title"]: plotting.AxisErrors(
-                rotation_deg=result.errors.rotation_axes_deg[views],
-                translation_mm=result.errors.translation_axes_mm[views],
+                result.errors.rotation_axes_deg[views], result.errors.translation_axes_mm[views]
             )
             for name, result in results.items()
         }
@@ -121,22 +119,27 @@ def picture(report: Mapping[str, Any], views: str) -> Figure:
     return plotting.axis_errors(series)
 
 
+def reported_views(test: ScanSet) -> dict[str, np.ndarray]:
+    """Indices of the views that errors are reported on, by their name in the record."""
+    return {"all": np.arange(len(test)), "hardest": hardest_views(test)}
+
+
 def compared(results: Mapping[str, Results], test: ScanSet) -> dict[str, Any]:
     """Errors of both on all test views and on the hardest, and by how much one is lower."""
-    rows = {"all": np.arange(len(test)), "hardest": hardest_views(test)}
+    rows = reported_views(test)
     report: dict[str, Any] = {"views": {name: len(views) for name, views in rows.items()}}
-    for name, result in results.items():
-        report[name] = figures(result, test)
+    report |= {name: figures(result, test) for name, result in results.items()}
     for name, views in rows.items():
-        errors = {
-            source: {
-                "mre_per_axis_deg": mean_per_axis(result.errors.rotation_axes_deg[views]),
-                "mte_per_axis_mm": mean_per_axis(result.errors.translation_axes_mm[views]),
-                "mre_per_view_deg": mean_per_view(result.errors.rotation_axes_deg[views]),
-                "mte_per_view_mm": mean_per_view(result.errors.translation_axes_mm[views]),
+        errors = {}
+        for source, result in results.items():
+            turns = result.errors.rotation_axes_deg[views]
+            shifts = result.errors.translation_axes_mm[views]
+            errors[source] = {
+                "mre_per_axis_deg": mean_per_axis(turns),
+                "mte_per_axis_mm": mean_per_axis(shifts),
+                "mre_per_view_deg": mean_per_view(turns),
+                "mte_per_view_mm": mean_per_view(shifts),
             }
-            for source, result in results.items()
-        }
         turned, moved = (
             1.0 - float(np.mean(errors[VIRTUAL][key]) / np.mean(errors[PUBLIC][key]))
             for key in ("mre_per_axis_deg", "mte_per_axis_mm")
@@ -154,12 +157,8 @@ def compared(results: Mapping[str, Results], test: ScanSet) -> dict[str, Any]:
 
 def table(report: Mapping[str, Any]) -> str:
     """Markdown: MRE and MTE per axis of both, and the reduction beside the paper's."""
-    lines = [
-        "| trained on | views | MRE x, y, z (deg) | MTE x, y, z (mm) | rotation (deg) | "
-        "translation (mm) |",
-        "|---|---|---|---|---|---|",
-    ]
-    for views in ("hardest", "all"):
+    rows = []
+    for views in VIEWS:
         for name in (PUBLIC, VIRTUAL):
             errors = report[f"{views}_views"][name]
             summary = report[name]["hardest" if views == "hardest" else "summary"]
@@ -172,12 +171,10 @@ def table(report: Mapping[str, Any]) -> str:
                 for key in ("rotation_error_deg", "translation_error_mm")
             )
             count = f"{report['views'][views]}, {views}"
-            lines.append(
-                f"| {report['trained_on'][name]['title']} | {count} | "
-                + " | ".join([*axes, *means])
-                + " |"
-            )
-    for views in ("hardest", "all"):
+            rows.append([report["trained_on"][name]["title"], count, *axes, *means])
+    head = ["trained on", "views", "MRE x, y, z (deg)", "MTE x, y, z (mm)", "rotation (deg)"]
+    lines = [markdown.table([*head, "translation (mm)"], rows)]
+    for views in VIEWS:
         fall = report[f"{views}_views"]["reduction"]
         lines += [
             "",

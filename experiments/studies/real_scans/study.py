@@ -24,13 +24,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from experiments.runner import markdown
 from experiments.runner import study_command as study
+from vanejax.cad import Part, load_part
 from vanejax.cad.cad_file import MM_PER_UNIT
-from vanejax.cad.part import Part, load_part
 from vanejax.errors import InputError
 from vanejax.files import read_json
 from vanejax.localization.registration import register
 from vanejax.rigid import RigidTransform, rigid_from_matrix
+from vanejax.scans import load_scan
 
 TRUTH = "ground_truth.json"
 RIGHT_DEG, RIGHT_MM, MOST_SECONDS = 5.0, 5.0, 5.0
@@ -52,6 +54,16 @@ class KnownScan:
     scan_units: str
     cad_units: str
     camera_from_part: np.ndarray
+
+    def points(self, part: Part) -> np.ndarray:
+        """[N, 3] f64 mm, camera frame: the scan of ``part``."""
+        return load_scan(self.scan, units=self.scan_units, part_extent_mm=part.extent_mm).points
+
+    def errors(self, part_from_camera: RigidTransform) -> dict[str, Any]:
+        """`error` by name, and whether the pose is right."""
+        angle, shift = self.error(part_from_camera)
+        right = angle < RIGHT_DEG and shift < RIGHT_MM
+        return {"rotation_deg": angle, "translation_mm": shift, "right": right}
 
     def error(self, part_from_camera: RigidTransform) -> tuple[float, float]:
         """Degrees and mm of a part_from_camera to the nearest right answer.
@@ -109,23 +121,17 @@ def _row(known: KnownScan, part: Part, seed: int, sensor: str | None) -> dict[st
     began = time.perf_counter()
     result = register(known.scan, part, units_scan=known.scan_units, sensor=sensor, seed=seed)
     seconds = time.perf_counter() - began
-    angle, shift = known.error(result.part_from_camera)
-    listed = [known.error(other.part_from_camera) for other in result.alternatives]
-    verification = result.verification
+    others = [known.errors(other.part_from_camera) for other in result.alternatives]
+    shares = ("inlier_share", "violation_share", "unmeasured_share", "tolerance_mm")
     return {
         "scan": known.scan.name,
         "part": part.name,
-        "rotation_deg": angle,
-        "translation_mm": shift,
-        "right": bool(angle < RIGHT_DEG and shift < RIGHT_MM),
-        "right_listed": any(a < RIGHT_DEG and s < RIGHT_MM for a, s in listed),
+        **known.errors(result.part_from_camera),
+        "right_listed": any(other["right"] for other in others),
         "verdict": result.verdict.status,
         "reason": result.verdict.reason,
-        "alternatives": len(listed),
-        "inlier_share": verification.inlier_share,
-        "violation_share": verification.violation_share,
-        "unmeasured_share": verification.unmeasured_share,
-        "tolerance_mm": verification.tolerance_mm,
+        "alternatives": len(others),
+        **{name: getattr(result.verification, name) for name in shares},
         "seconds": seconds,
     }
 
@@ -190,21 +196,23 @@ def table(report: dict[str, Any]) -> str:
 
 def sensor_table(report: dict[str, Any]) -> str:
     """Markdown: the scans as they are beside those without what the named sensor rounds off."""
-    lines = [
-        f"| of {report['scans']} scans | right: within {RIGHT_DEG:g} deg, {RIGHT_MM:g} mm | "
-        f"within {NEAR_DEG:g} deg, {NEAR_MM:g} mm | accepted (wrong) | mean (deg) | mean (mm) | "
-        "time (s) |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    sensor = report["sensor"]
-    for name, rows in (("as they are", report), (f"`--sensor {sensor['name']}`", sensor)):
-        mean = rows["mean_of_right"]
-        lines.append(
-            f"| {name} | {rows['right']} | {rows['near']} | {rows['accepted']} "
-            f"({rows['accepted_wrong']}) | {mean['rotation_deg']:.2f} | "
-            f"{mean['translation_mm']:.2f} | {rows['seconds']['median']:.2f} |"
+    sensor, rows = report["sensor"], []
+    for name, found in (("as they are", report), (f"`--sensor {sensor['name']}`", sensor)):
+        mean = found["mean_of_right"]
+        rows.append(
+            [
+                name,
+                str(found["right"]),
+                str(found["near"]),
+                f"{found['accepted']} ({found['accepted_wrong']})",
+                f"{mean['rotation_deg']:.2f}",
+                f"{mean['translation_mm']:.2f}",
+                f"{found['seconds']['median']:.2f}",
+            ]
         )
-    return "\n".join(lines)
+    head = [f"of {report['scans']} scans", f"right: within {RIGHT_DEG:g} deg, {RIGHT_MM:g} mm"]
+    head += [f"within {NEAR_DEG:g} deg, {NEAR_MM:g} mm", "accepted (wrong)"]
+    return markdown.table([*head, "mean (deg)", "mean (mm)", "time (s)"], rows)
 
 
 def main(settings: argparse.Namespace) -> dict[str, Any]:
@@ -213,9 +221,8 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     report = study.header("register, no guess, no training", settings)
     report |= summarize(measure(truth, settings.seed))
     if settings.sensor is not None:
-        report["sensor"] = {"name": settings.sensor} | summarize(
-            measure(truth, settings.seed, settings.sensor)
-        )
+        again = summarize(measure(truth, settings.seed, settings.sensor))
+        report["sensor"] = {"name": settings.sensor} | again
     report = study.save(settings.out, "real_scans", report)
     print(table(report))
     if settings.sensor is not None:

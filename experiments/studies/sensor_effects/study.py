@@ -119,14 +119,14 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
         for name, sensor in effects().items()
     }
     times = time_effects(views, settings.views, settings.repeats, settings.seed)
-    rows = {}
-    for name, scan in taken.items():
-        error = off_surface_mm(scan)
-        rows[name] = {
+    rows = {
+        name: {
             "hole_share": scan.hole_share,
-            "rms_mm": float(np.sqrt(np.mean(error**2))),
+            "rms_mm": float(np.sqrt(np.mean(off_surface_mm(scan) ** 2))),
             **times[name],
         }
+        for name, scan in taken.items()
+    }
     report = study.header("the sensor's effects, one at a time", settings, views.part)
     report = study.save(settings.out, "sensor_effects", report | {"effects": rows})
     errors = {name: scan for name, scan in taken.items() if name != "ideal"}

@@ -16,8 +16,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from vanejax.errors import InputError
-from vanejax.localization.fine_registration import refine
-from vanejax.localization.residuals import RayCasting
+from vanejax.localization import RayCasting, refine
 from vanejax.rigid import RigidTransform
 from vanejax.scans.robust_statistics import robust_sigma
 
@@ -212,8 +211,7 @@ def residual_gap(one: Sequence[Compared], other: Sequence[Compared]) -> float:
     """Two-sample Kolmogorov-Smirnov statistic of the residuals away from edges: 0 to 1."""
 
     def inner(scans: Sequence[Compared]) -> np.ndarray:
-        residuals = [scan.residual_mm[scan.edge_px > EDGE_PX] for scan in scans]
-        joined = np.concatenate(residuals)
+        joined = np.concatenate([scan.residual_mm[scan.edge_px > EDGE_PX] for scan in scans])
         return joined[np.isfinite(joined)]
 
     return float(stats.ks_2samp(inner(one), inner(other)).statistic)
@@ -239,9 +237,6 @@ def _slope(x: np.ndarray, y: np.ndarray) -> float:
 def _differences(scan: Compared, lag: int) -> np.ndarray:
     """Of residuals away from edges that lie ``lag`` columns or rows apart."""
     inner = np.where(scan.edge_px > EDGE_PX, scan.residual_mm, np.nan)
-    both = [
-        (inner[lag:] - inner[:-lag]).ravel(),
-        (inner[:, lag:] - inner[:, :-lag]).ravel(),
-    ]
-    joined = np.concatenate(both)
+    down, across = inner[lag:] - inner[:-lag], inner[:, lag:] - inner[:, :-lag]
+    joined = np.concatenate([down.ravel(), across.ravel()])
     return joined[np.isfinite(joined) & (np.abs(joined) < MOST_MM)]

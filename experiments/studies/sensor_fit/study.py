@@ -5,9 +5,8 @@ python -m experiments.sensor_fit FOLDER [--out DIR] [--fit]
 FOLDER is that of `experiments.real_scans`. Every real scan is compared with what the CAD model
 predicts at its refined true pose; so are virtual scans of the same part in the same pose, by an
 ideal camera, with one effect of `vanejax.scanner.sensor.consumer_depth` alone, with all and with
-all but
-one. ``--fit`` searches the values of that preset on every other scan and prints them. Results: a
-table, sensor_fit.json and real_scans.png in ``--out``.
+all but one. ``--fit`` searches the values of that preset on every other scan and prints them.
+Results: a table, sensor_fit.json and real_scans.png in ``--out``.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -36,25 +35,13 @@ from experiments.studies.sensor_fit.sensor_statistics import (
     residual_gap,
     statistics,
 )
-from vanejax.cad.part import load_part
-from vanejax.localization.residuals import RayCasting, measurement_model
-from vanejax.plotting.canvas import (
-    DEVIATION_COLORMAP,
-    INK,
-    LABEL_PT,
-    SENSORS,
-    WIDTH_IN,
-    add_color_bar,
-    add_legend,
-    new_figure,
-    save_figure,
-    style_chart,
-)
+from vanejax.cad import load_part
+from vanejax.localization import RayCasting, measurement_model
+from vanejax.plotting import canvas
 from vanejax.rigid import RigidTransform
-from vanejax.scanner import measurement
-from vanejax.scanner.camera import Camera, field_of_view_deg
-from vanejax.scanner.sensor import Sensor, consumer_depth
-from vanejax.scans.scan_file import load_scan
+from vanejax.scanner import Camera, Sensor, measurement
+from vanejax.scanner.camera import field_of_view_deg
+from vanejax.scanner.sensor import consumer_depth
 
 FOCAL_PX = (150.0, 300.0)  # between which that of the real camera is sought
 WIDTH, HEIGHT = 424, 240
@@ -99,8 +86,7 @@ SHOWN = ("Separator_2", "Range_Hood_4")
 """In the picture: two that the preset was not fitted to."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class RealScan:
+class RealScan(NamedTuple):
     """One scan, its part, and about where the part stood.
 
     Attributes:
@@ -115,6 +101,11 @@ class RealScan:
     camera_from_part: RigidTransform
     points: np.ndarray
 
+    def compared(self, grid: Grid, points: np.ndarray | None = None) -> Compared:
+        """The scan, or other ``points`` of the same part in the same pose, with the prediction."""
+        points = self.points if points is None else points
+        return compared(self.model, points, self.camera_from_part, grid)
+
 
 def load(folder: Path) -> list[RealScan]:
     """The scans of a folder.
@@ -122,18 +113,14 @@ def load(folder: Path) -> list[RealScan]:
     Raises:
       InputError: as `load_truth`, or a file that cannot be read.
     """
-
-    @functools.cache
-    def model(cad: Path, units: str) -> RayCasting:
-        part = load_part(cad, units=units)
-        return measurement_model(part, np.zeros(3))
-
+    model = functools.cache(
+        lambda cad, units: measurement_model(load_part(cad, units=units), np.zeros(3))
+    )
     scans = []
     for known in load_truth(folder):
         of = model(known.cad, known.cad_units)
-        scan = load_scan(known.scan, units=known.scan_units, part_extent_mm=of.part.extent_mm)
         pose = RigidTransform.from_matrix(known.camera_from_part[0])
-        scans.append(RealScan(known.scan.stem, of, pose, scan.points))
+        scans.append(RealScan(known.scan.stem, of, pose, known.points(of.part)))
     return scans
 
 
@@ -155,8 +142,7 @@ def measured_by(scans: Sequence[RealScan], sensor: Sensor, seed: int) -> list[Co
     for number, scan in enumerate(scans):
         rng = np.random.default_rng([seed, number])
         taken = measurement.measure(scan.model.scanner, sensor, scan.camera_from_part, rng)
-        points = taken.points.astype(np.float64)
-        result.append(compared(scan.model, points, scan.camera_from_part, grid))
+        result.append(scan.compared(grid, taken.points.astype(np.float64)))
     return result
 
 
@@ -173,11 +159,10 @@ def with_values(sensor: Sensor, values: Mapping[str, float]) -> Sensor:
         "dropout_rate": (0.0, 1.0),
         "max_incidence_deg": (30.0, 90.0),
     }
-    limited = {
-        name: float(np.clip(value, *bounds.get(name, (0.0, 100.0))))
-        for name, value in values.items()
-    }
-    return dataclasses.replace(sensor, **limited)
+    return dataclasses.replace(
+        sensor,
+        **{name: float(np.clip(v, *bounds.get(name, (0.0, 100.0)))) for name, v in values.items()},
+    )
 
 
 def fit(
@@ -222,12 +207,13 @@ def measure(
 
     Distances are to the real scans: of all, and of those half of them that were not fitted to.
     """
-    made = {"ideal": measured_by(scans, full.only(), seed)}
-    for effect in EFFECTS:
-        made[f"+ {effect}"] = measured_by(scans, full.only(*EFFECTS[effect]), seed)
-    made["all"] = measured_by(scans, full, seed)
-    for effect in EFFECTS:
-        made[f"all but {effect}"] = measured_by(scans, without(full, effect), seed)
+    sensors = {
+        "ideal": full.only(),
+        **{f"+ {effect}": full.only(*names) for effect, names in EFFECTS.items()},
+        "all": full,
+        **{f"all but {effect}": without(full, effect) for effect in EFFECTS},
+    }
+    made = {name: measured_by(scans, sensor, seed) for name, sensor in sensors.items()}
     of_all = statistics(real)
     fitted, held_out = halves(real)
     of_fitted, of_held_out = statistics(fitted), statistics(held_out)
@@ -257,13 +243,10 @@ def table(report: Mapping[str, Any]) -> str:
     """Figures of real and virtual scans side by side, as Markdown; then the distances."""
     virtual, real = report["virtual"], report["real"]
     shown = [name for name in virtual if not name.startswith("all but")]
+    columns = [real["statistics"], *(virtual[name]["statistics"] for name in shown)]
     rows = [
-        [
-            figure,
-            _cell(figure, value),
-            *(_cell(figure, virtual[name]["statistics"][figure]) for name in shown),
-        ]
-        for figure, value in real["statistics"].items()
+        [figure, *(_cell(figure, column[figure]) for column in columns)]
+        for figure in real["statistics"]
     ]
     for title, key, halves_key in (
         ("**distance, all scans**", "distance", "distance_of_halves"),
@@ -292,15 +275,17 @@ def picture(scans: Sequence[RealScan], taken: Mapping[str, Sequence[Compared]]) 
     columns = {"real": "real", "ideal": "ideal", "all": "consumer_depth"}
     names = [scan.name for scan in scans]
     chosen = [names.index(name) for name in SHOWN if name in names] or [0]
-    figure = new_figure(WIDTH_IN, 2.2 * len(chosen))
+    figure = canvas.new_figure(canvas.WIDTH_IN, 2.2 * len(chosen))
     panels = figure.subplots(len(chosen), 4, squeeze=False, width_ratios=(1, 1, 1, 1.3))
     for row, number in zip(panels, chosen, strict=True):
-        style_chart(row[3], title="away from edges", xlabel="residual (mm)", ylabel="share per mm")
+        canvas.style_chart(
+            row[3], title="away from edges", xlabel="residual (mm)", ylabel="share per mm"
+        )
         for axes, (key, sensor) in zip(row, columns.items(), strict=False):
-            scan, style = taken[key][number], SENSORS[sensor]
-            image = axes.imshow(scan.residual_mm, cmap=DEVIATION_COLORMAP, vmin=-4, vmax=4)
+            scan, style = taken[key][number], canvas.SENSORS[sensor]
+            image = axes.imshow(scan.residual_mm, cmap=canvas.DEVIATION_COLORMAP, vmin=-4, vmax=4)
             title = "real" if key == "real" else f"virtual,\n{sensor}"
-            axes.set_title(title, color=INK, fontsize=LABEL_PT, loc="left")
+            axes.set_title(title, color=canvas.INK, fontsize=canvas.LABEL_PT, loc="left")
             axes.set_axis_off()
             inner = scan.residual_mm[scan.edge_px > EDGE_PX]
             row[3].hist(
@@ -310,12 +295,14 @@ def picture(scans: Sequence[RealScan], taken: Mapping[str, Sequence[Compared]]) 
             )  # fmt: skip
         row[0].text(
             -0.05, 0.5, names[number], transform=row[0].transAxes, rotation=90, ha="right",
-            va="center", color=INK, fontsize=LABEL_PT,
+            va="center", color=canvas.INK, fontsize=canvas.LABEL_PT,
         )  # fmt: skip
-        add_color_bar(figure, row[2], image, "measured - predicted (mm)", shrink=0.9)
+        canvas.add_color_bar(figure, row[2], image, "measured - predicted (mm)", shrink=0.9)
         row[3].set_yscale("log")
         row[3].set_ylim(1e-3, 60)
-    add_legend(figure, row[3].get_legend_handles_labels()[0], loc="outside lower right", ncols=3)
+    canvas.add_legend(
+        figure, row[3].get_legend_handles_labels()[0], loc="outside lower right", ncols=3
+    )
     return figure
 
 
@@ -323,7 +310,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     """The comparison, after a fit if that is wanted."""
     scans = load(settings.folder)
     grid = find_grid([scan.points for scan in scans], lowest_px=FOCAL_PX[0], highest_px=FOCAL_PX[1])
-    real = [compared(scan.model, scan.points, scan.camera_from_part, grid) for scan in scans]
+    real = [scan.compared(grid) for scan in scans]
     full = dataclasses.replace(consumer_depth(), camera=camera(grid))
     if settings.fit:
         some, wanted = halves(scans)[0], statistics(halves(real)[0])
@@ -347,7 +334,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
         "sensor": values | {"correlation_px": full.correlation_px},
     }
     report = study.save(settings.out, "sensor_fit", report | figures)
-    save_figure(picture(scans, taken), settings.out / "real_scans.png")
+    canvas.save_figure(picture(scans, taken), settings.out / "real_scans.png")
     print(table(report))
     return report
 

@@ -13,8 +13,7 @@ interrupted run goes on where it stopped. Results: a table and sensor_transfer.j
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,34 +22,26 @@ from tqdm import tqdm
 
 from experiments.runner import markdown
 from experiments.runner import study_command as study
-from experiments.runner.experiment import (
-    DataSettings,
-    Experiment,
-    PartSettings,
-    TrainingSettings,
-)
+from experiments.runner.experiment import DataSettings, Experiment, PartSettings, TrainingSettings
 from experiments.runner.run_folder import RunFolder
 from experiments.runner.vane_views import perturb
-from experiments.studies.real_scans.study import RIGHT_DEG, RIGHT_MM, KnownScan, load_truth
+from experiments.studies.real_scans.study import KnownScan, load_truth
 from experiments.train import fit, load_or_scan
-from vanejax.cad.part import Part
 from vanejax.errors import InputError
-from vanejax.localization.fine_registration import refine
+from vanejax.localization import RayCasting, measurement_model, pose_batch, refine
 from vanejax.localization.matched_poses import match_poses
-from vanejax.localization.residuals import measurement_model
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.sensor import preset
-from vanejax.scans.measured_scan import MeasuredScan
-from vanejax.scans.scan_file import load_scan
+from vanejax.scans import MeasuredScan
+from vanejax.training import RpmNetLoss, TrainedMatcher
 from vanejax.training.export import export_workdir
 from vanejax.training.online_scans import OnlineScans
-from vanejax.training.rpmnet_loss import RpmNetLoss
-from vanejax.training.weight_file import TrainedMatcher
 
 START_DEG, START_SHARE = 45.0, 0.5  # of the part's radius
 DISTANCES_MM = (170.0, 390.0)  # between which the real scans were taken
 IDEAL = "ideal"  # the network that saw no effects
 NO_NETWORK = "none: the rough pose"
+STAGES, ERRORS = ("alone", "refined"), ("rotation_deg", "translation_mm")
 _STARTS = 0x7247  # folded into the seed
 
 
@@ -84,79 +75,50 @@ def network(config: Experiment, folder: Path) -> TrainedMatcher:
     return export_workdir(folder, folder / "model.npz", checkpoint="last")
 
 
-class Trial:
-    """Registers real scans of one part with several networks."""
-
-    def __init__(self, part: Part, networks: dict[str, TrainedMatcher]) -> None:
-        self.part, self.networks = part, networks
-        self._model = measurement_model(part, np.zeros(3))
-
-    def rows(
-        self, known: KnownScan, *, starts: int, rng: np.random.Generator
-    ) -> list[dict[str, Any]]:
-        """What every network finds in one scan, from each start."""
-        extent = self.part.extent_mm
-        points = load_scan(known.scan, units=known.scan_units, part_extent_mm=extent).points
-        scan = MeasuredScan(points, None, np.zeros(3))
-        inits = [self._start(known, rng) for _ in range(starts)]
-        guesses = RigidTransform(
-            np.stack([init.rotation for init in inits]),
-            np.stack([init.translation for init in inits]),
-        )
-        rows: list[dict[str, Any]] = [{"scan": known.scan.name} for _ in inits]
-        for name, matcher in self.networks.items():
-            began = time.perf_counter()
-            found = match_poses(matcher, scan, guesses, iterations=matcher.iterations)
-            seconds = (time.perf_counter() - began) / starts
-            for index, row in enumerate(rows):
-                matched = RigidTransform(found.rotation[index], found.translation[index])
-                fine = refine(self._model, points, matched).part_from_camera
-                row[name] = {
-                    "alone": _errors(known, matched) | {"time_s": seconds},
-                    "refined": _errors(known, fine),
-                }
-        for row, init in zip(rows, inits, strict=True):
-            fine = refine(self._model, points, init).part_from_camera
-            row[NO_NETWORK] = {"alone": _errors(known, init), "refined": _errors(known, fine)}
-        return rows
-
-    def _start(self, known: KnownScan, rng: np.random.Generator) -> RigidTransform:
-        """A pose beside one of the right ones."""
-        right = known.camera_from_part[rng.integers(len(known.camera_from_part))]
-        return perturb(
-            RigidTransform.from_matrix(right).inverse(),
-            self.part,
-            deg=rng.uniform(0, START_DEG),
-            mm=rng.uniform(0, START_SHARE) * self.part.radius,
-            rng=rng,
-        )
-
-
-def _errors(known: KnownScan, found: RigidTransform) -> dict[str, Any]:
-    rotation_deg, translation_mm = known.error(found)
-    return {
-        "rotation_deg": rotation_deg,
-        "translation_mm": translation_mm,
-        "right": bool(rotation_deg < RIGHT_DEG and translation_mm < RIGHT_MM),
+def register_all(
+    known: KnownScan,
+    model: RayCasting,
+    networks: Mapping[str, TrainedMatcher],
+    *,
+    starts: int,
+    rng: np.random.Generator,
+) -> list[dict[str, Any]]:
+    """A row for each rough pose of one scan: what every network makes of it, and what none does."""
+    points = known.points(model.part)
+    scan = MeasuredScan(points, None, np.zeros(3))
+    rough = pose_batch.stack(*(_start(known, model, rng) for _ in range(starts)))
+    found = {
+        name: match_poses(matcher, scan, rough, iterations=matcher.iterations)
+        for name, matcher in networks.items()
     }
+    rows: list[dict[str, Any]] = []
+    for index in range(starts):
+        rows.append({"scan": known.scan.name})
+        for name, poses in (found | {NO_NETWORK: rough}).items():
+            alone = pose_batch.select(poses, index)
+            refined = refine(model, points, alone).part_from_camera
+            rows[-1][name] = {"alone": known.errors(alone), "refined": known.errors(refined)}
+    return rows
+
+
+def _start(known: KnownScan, model: RayCasting, rng: np.random.Generator) -> RigidTransform:
+    """A pose beside one of the right ones."""
+    right = known.camera_from_part[rng.integers(len(known.camera_from_part))]
+    pose, part = RigidTransform.from_matrix(right).inverse(), model.part
+    deg, mm = rng.uniform(0, START_DEG), rng.uniform(0, START_SHARE) * part.radius
+    return perturb(pose, part, deg=deg, mm=mm, rng=rng)
 
 
 def summarize(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str, Any]:
     """How many are right and their share, and medians, by network and stage."""
-    return {
-        name: {
-            stage: {
-                "registrations": len(rows),
-                "right": float(np.mean([row[name][stage]["right"] for row in rows])),
-                **{
-                    error: float(np.median([row[name][stage][error] for row in rows]))
-                    for error in ("rotation_deg", "translation_mm")
-                },
-            }
-            for stage in ("alone", "refined")
-        }
-        for name in names
-    }
+
+    def of_stage(name: str, stage: str) -> dict[str, float]:
+        found = [row[name][stage] for row in rows]
+        medians = {error: float(np.median([one[error] for one in found])) for error in ERRORS}
+        right = float(np.mean([one["right"] for one in found]))
+        return {"registrations": len(rows), "right": right, **medians}
+
+    return {name: {stage: of_stage(name, stage) for stage in STAGES} for name in names}
 
 
 def table(report: dict[str, Any]) -> str:
@@ -164,22 +126,14 @@ def table(report: dict[str, Any]) -> str:
     rows = []
     for part, summary in report["summary"].items():
         for name, stages in summary.items():
-            rows.append([name, part])
-            for stage in (stages["alone"], stages["refined"]):
+            cells = [name, part]
+            for stage in (stages[key] for key in STAGES):
                 right = round(stage["right"] * stage["registrations"])
-                rows[-1] += [f"{right} of {stage['registrations']}"]
-                rows[-1] += [f"{stage[error]:.2f}" for error in ("rotation_deg", "translation_mm")]
-    head = [
-        "network trained on",
-        "part",
-        "by it: right",
-        "deg",
-        "mm",
-        "refined: right",
-        "deg",
-        "mm",
-    ]
-    return markdown.table(head, rows)
+                cells += [f"{right} of {stage['registrations']}"]
+                cells += [f"{stage[error]:.2f}" for error in ERRORS]
+            rows.append(cells)
+    head = ["network trained on", "part", "by it: right", "deg", "mm", "refined: right", "deg"]
+    return markdown.table([*head, "mm"], rows)
 
 
 def sensor_name(text: str) -> str:
@@ -203,13 +157,15 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
                 first, settings.sensor, effects=effects, steps=settings.steps, seed=settings.seed
             )
             networks[name] = network(config, settings.out / config.name)
-        trial = Trial(config.make_part(), networks)
+        model = measurement_model(config.make_part(), np.zeros(3))
         scans = [known for known in truth if known.cad == first.cad]
         rows[first.cad.stem] = [
             row
             for number, known in enumerate(tqdm(scans, first.cad.stem, unit="scan"))
-            for row in trial.rows(
+            for row in register_all(
                 known,
+                model,
+                networks,
                 starts=settings.starts,
                 rng=np.random.default_rng([settings.seed, _STARTS, number]),
             )

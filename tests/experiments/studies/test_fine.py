@@ -57,22 +57,16 @@ def test_noise_is_along_the_rays(points: np.ndarray) -> None:
     assert np.std(along) == pytest.approx(0.2, rel=0.06)
 
 
-def test_a_start_is_as_far_off_as_it_says(views: VaneViews) -> None:
-    truth, center = views.truth(VIEW), views.part.center
-    for seed in range(5):
-        rng = np.random.default_rng(seed)
-        start = perturb(truth, views.part, deg=5.0, mm=3.0, rng=rng)
-        assert magnitudes(pose_error(start, truth, center)) == pytest.approx((5.0, 3.0), abs=1e-9)
-
-
-def test_the_error_undoes_itself(views: VaneViews) -> None:
-    """Applied to what was found as `residuals.moved` does, it gives the truth."""
-    truth = views.truth(VIEW)
-    found = perturb(truth, views.part, deg=20.0, mm=9.0, rng=np.random.default_rng(3))
-    error = pose_error(found, truth, views.part.center)
-    again = moved(views.part, stack(found), error[None])
-    np.testing.assert_allclose(again.rotation[0], truth.rotation, atol=1e-12)
-    np.testing.assert_allclose(again.translation[0], truth.translation, atol=1e-9)
+def test_a_start_is_as_far_off_as_it_says_and_its_error_undoes_it(views: VaneViews) -> None:
+    """Applied to the start as `residuals.moved` does, the error gives the truth."""
+    truth, part = views.truth(VIEW), views.part
+    for seed, (deg, mm) in enumerate(((5.0, 3.0), (20.0, 9.0))):
+        start = perturb(truth, part, deg=deg, mm=mm, rng=np.random.default_rng(seed))
+        error = pose_error(start, truth, part.center)
+        assert magnitudes(error) == pytest.approx((deg, mm), abs=1e-9)
+        again = moved(part, stack(start), error[None])
+        np.testing.assert_allclose(again.rotation[0], truth.rotation, atol=1e-12)
+        np.testing.assert_allclose(again.translation[0], truth.translation, atol=1e-9)
 
 
 def test_the_bound_is_that_of_numerical_derivatives(views: VaneViews, points: np.ndarray) -> None:
@@ -128,16 +122,13 @@ def test_an_honest_and_efficient_estimate_is_seen_to_be_one() -> None:
     assert table([report]).splitlines()[-1].startswith("met")
 
 
-def test_a_covariance_that_is_too_small_is_seen() -> None:
-    report = summarize(made_up(claimed=0.25), 0.1)
-    assert report["anees"] == pytest.approx(4, abs=0.4)
-    assert report["coverage_95"] < 0.5
-
-
-def test_one_bad_view_misses_the_goal() -> None:
-    report = summarize(made_up(worst=50), 0.1)
-    assert report["translation_mm"]["worst_view_ratio"] > 4
-    assert table([report]).splitlines()[-1].startswith("MISSED")
+def test_a_covariance_that_is_too_small_and_one_bad_view_are_seen() -> None:
+    small = summarize(made_up(claimed=0.25), 0.1)
+    assert small["anees"] == pytest.approx(4, abs=0.4)
+    assert small["coverage_95"] < 0.5
+    bad = summarize(made_up(worst=50), 0.1)
+    assert bad["translation_mm"]["worst_view_ratio"] > 4
+    assert table([bad]).splitlines()[-1].startswith("MISSED")
 
 
 def test_the_study_reaches_the_bound(tmp_path: Path, monkeypatch, capsys, views: VaneViews) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from experiments.studies.real_scans import study as real_scans
 from experiments.studies.real_scans.study import (
     KnownScan,
     load_truth,
@@ -17,7 +18,6 @@ from experiments.studies.real_scans.study import (
     summarize,
     table,
 )
-from experiments.studies.real_scans.study import measure as measure_real_scans
 from experiments.studies.verdicts.challenge_parts import challenge_parts
 from experiments.studies.verdicts.depth_camera import measure, random_pose
 from vanejax.cad.symmetry import rotation_about
@@ -44,16 +44,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pose = random_pose(np.random.default_rng(number), part, 300.0)
         points = measure(part, Scanner(part), pose, kind="depth_camera", seed=number)
         save_points(folder / f"pump_{number}.ply", points / 1000)
-        entries.append(
-            {
-                "part": "pump",
-                "scan": f"pump_{number}.ply",
-                "cad": "pump.stl",
-                "cad_unit_mm": 10.0,
-                "scan_units": "m",
-                "scan_from_cad_mm": [pose.as_matrix().tolist()],
-            }
-        )
+        known_pose = {"scan_units": "m", "scan_from_cad_mm": [pose.as_matrix().tolist()]}
+        files = {"scan": f"pump_{number}.ply", "cad": "pump.stl", "cad_unit_mm": 10.0}
+        entries.append(files | known_pose)
     (folder / "ground_truth.json").write_text(json.dumps(entries))
     return folder
 
@@ -175,7 +168,7 @@ def test_an_accepted_wrong_pose_is_seen() -> None:
 )
 def test_a_real_scan_is_within_5_deg_and_5_mm_from_no_guess(scan: KnownScan) -> None:
     """Scans of a depth camera: right, and never rejected."""
-    (row,) = measure_real_scans([scan], seed=0)
+    (row,) = real_scans.measure([scan], seed=0)
     assert row["right"]
     assert row["verdict"] in ("accepted", "ambiguous")
 

@@ -6,18 +6,12 @@ import dataclasses
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from experiments.studies.sensor_transfer import study as sensor_transfer
-from experiments.studies.sensor_transfer.study import (
-    IDEAL,
-    NO_NETWORK,
-    main,
-    make_parser,
-    recipe,
-    table,
-)
+from experiments.studies.sensor_transfer.study import IDEAL, NO_NETWORK, main, make_parser
 from vanejax.cad.parametric_vane import guide_vane
 from vanejax.scanner.camera import hemisphere_viewpoints
 from vanejax.scanner.measurement import measure
@@ -35,17 +29,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     part.export(folder / "part.stl")
     pose = hemisphere_viewpoints(part.center).view(60)
     sensor = preset("paper_camera").scaled(0.4)
-    save_points(
-        folder / "scan.ply",
-        measure(Scanner(part), sensor, pose, np.random.default_rng(0)).points,
-    )
+    scan = measure(Scanner(part), sensor, pose, np.random.default_rng(0))
+    save_points(folder / "scan.ply", scan.points)
     entry = {
-        "scan": "scan.ply",
-        "cad": "part.stl",
-        "cad_unit_mm": 1.0,
-        "scan_units": "mm",
+        "scan": "scan.ply", "cad": "part.stl", "cad_unit_mm": 1.0, "scan_units": "mm",
         "scan_from_cad_mm": [pose.as_matrix().tolist()],
-    }
+    }  # fmt: skip
     (folder / "ground_truth.json").write_text(json.dumps([entry]))
     return folder
 
@@ -57,7 +46,7 @@ def test_a_good_network_and_a_bad_one_are_told_apart(
     good = find_weights("pretrained", guide_vane())
     assert good is not None
     # weights that know nothing: every feature alike
-    bad = dataclasses.replace(good, variables=_zeroed(good.variables))
+    bad = dataclasses.replace(good, variables=jax.tree.map(np.zeros_like, good.variables))
     asked = []
 
     def network(config, place):
@@ -67,10 +56,7 @@ def test_a_good_network_and_a_bad_one_are_told_apart(
     monkeypatch.setattr(sensor_transfer, "network", network)
     arguments = [str(folder), "--out", str(tmp_path), "--starts", "3", "--steps", "7"]
     report = main(make_parser().parse_args([*arguments, "--sensor", "paper_camera"]))
-    assert asked == [
-        (False, tmp_path / "part_ideal"),
-        (True, tmp_path / "part_paper_camera"),
-    ]
+    assert asked == [(False, tmp_path / "part_ideal"), (True, tmp_path / "part_paper_camera")]
     found = report["summary"]["all"]
     assert found["paper_camera"]["alone"]["right"] == 1.0
     assert found["paper_camera"]["alone"]["rotation_deg"] < 2
@@ -82,21 +68,14 @@ def test_a_good_network_and_a_bad_one_are_told_apart(
     assert found[IDEAL]["alone"]["registrations"] == 3
     assert json.loads((tmp_path / "sensor_transfer.json").read_text()) == report
     printed = capsys.readouterr().out
-    assert table(report) in printed
+    assert sensor_transfer.table(report) in printed
     assert "| paper_camera | all | 3 of 3 |" in printed
-
-
-def _zeroed(tree):
-    return {
-        name: _zeroed(leaf) if isinstance(leaf, dict) else np.zeros_like(leaf)
-        for name, leaf in tree.items()
-    }
 
 
 def test_two_trainings_differ_in_the_effects_alone(folder: Path) -> None:
     (known,) = sensor_transfer.load_truth(folder)
     real, ideal = (
-        recipe(known, "consumer_depth", effects=effects, steps=9, seed=4)
+        sensor_transfer.recipe(known, "consumer_depth", effects=effects, steps=9, seed=4)
         for effects in (True, False)
     )
     real.check()
