@@ -68,12 +68,7 @@ def icp(
 def ransac(
     *, feature_radius: float, max_distance: float, num_hypotheses: int = 100_000
 ) -> Register:
-    """Open3D's RANSAC over FPFH matches, the relative of `vanejax.matching.baselines.sac_ia`.
-
-    Args:
-      feature_radius: of an FPFH neighbourhood.
-      max_distance: farthest partner of an inlier.
-      num_hypotheses: samples at most; Open3D's default.
+    """Open3D's RANSAC over FPFH matches, with settings of `vanejax.matching.baselines.sac_ia`.
 
     Raises:
       InputError: no Open3D.
@@ -108,14 +103,7 @@ def fgr(
     tuple_similarity: float = 0.95,
     num_tuples: int = 1000,
 ) -> Register:
-    """Open3D's Fast Global Registration, the relative of `vanejax.matching.baselines.fgr.fgr`.
-
-    Args:
-      feature_radius: of an FPFH neighbourhood.
-      max_distance: the width delta at which the scale of the robust kernel stays. Open3D compares
-        its setting with the squared scale, so that it is given the square.
-      tuple_similarity: least ratio of corresponding edges of a triangle of matches.
-      num_tuples: triangles at most.
+    """Open3D's Fast Global Registration, with settings of `vanejax.matching.baselines.fgr.fgr`.
 
     Raises:
       InputError: no Open3D.
@@ -131,6 +119,7 @@ def fgr(
             division_factor=1.4,
             use_absolute_scale=False,
             decrease_mu=True,
+            # Open3D compares it with the squared scale of the robust kernel
             maximum_correspondence_distance=(max_distance / max(radius, 1e-9)) ** 2,
             iteration_number=64,
             tuple_scale=tuple_similarity,

@@ -54,11 +54,8 @@ class Series:
 
     Attributes:
       name: for files, and ``title`` for readers.
-      unit: of ``values``.
-      values: strengths.
-      take: ``take(value, number)`` makes scan ``number`` at this strength; same arguments, same
-        bits.
-      views: how many scans there are at each.
+      values: strengths, in ``unit``, with ``views`` scans at each.
+      take: ``take(value, number)`` makes one of them; same arguments, same bits.
       max_allowance_mm: of the fine registration: how much stock it may find; 0 for none.
       paper: the paper's mean RMSE and FFMDE over this series, mm, where it has one (Fig. 11).
     """

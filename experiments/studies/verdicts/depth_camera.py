@@ -52,17 +52,10 @@ def random_pose(rng: np.random.Generator, part: Part, distance_mm: float) -> Rig
 def measure(
     part: Part, scanner: Scanner, camera_from_part: RigidTransform, *, kind: str, seed: int
 ) -> np.ndarray:
-    """One scan of the part by a sensor, exposed for its distance.
+    """Points [N, 3] f64, mm, of one scan by a sensor of that kind, exposed for its distance.
 
-    Args:
-      part: what is scanned.
-      scanner: of that part.
-      camera_from_part: the pose, such as `random_pose` gives.
-      kind: one of `KINDS`; "clutter" is structured light with a table or a clamp in the view.
-      seed: of all errors; the same arguments give the same points.
-
-    Returns:
-      points [N, 3] f64, mm, camera frame (looking along -z), in pixel order.
+    They are in the camera's frame, which looks along -z, in pixel order; the same arguments give
+    the same points. "clutter" is structured light with a table or a clamp in the view.
 
     Raises:
       InputError: nothing of the part is measured.
