@@ -30,7 +30,7 @@ def plate() -> np.ndarray:
     ids=["knot", "far away", "tiny", "plate", "triangle", "needle"],
 )
 def test_it_holds_every_vertex_with_a_margin(vertices):
-    envelope = PartEnvelope.around(vertices)
+    envelope = PartEnvelope(vertices)
     outward = scipy.spatial.ConvexHull(envelope.corners).equations
     beyond = vertices @ outward[:, :3].T + outward[:, 3]
     radius = np.linalg.norm(vertices - vertices.mean(axis=0), axis=-1).max()
@@ -43,7 +43,7 @@ def test_it_holds_every_vertex_with_a_margin(vertices):
 def test_its_size_is_bounded_whatever_the_mesh():
     fine = trimesh.creation.icosphere(6, 50.0).vertices
     assert len(fine) > 40_000
-    envelope = PartEnvelope.around(fine)
+    envelope = PartEnvelope(fine)
     assert len(envelope.corners) <= 2 * SIDES - 4  # Euler: of a polytope of simple corners
     assert len(envelope.edges) <= 3 * len(envelope.corners) - 6
     assert np.linalg.norm(envelope.corners, axis=-1).max() < 1.05 * 50  # 1 / cos 12 deg + 1e-3
@@ -79,7 +79,7 @@ CAMERAS = {
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_windows_hold_every_pixel_of_the_hull_once(camera, pixels):
     for vertices in (knot(), plate()):
-        windows = PartEnvelope.around(vertices).windows(camera, POSE, pixels=pixels)
+        windows = PartEnvelope(vertices).windows(camera, POSE, pixels=pixels)
         count = covered(windows, camera)
         wanted = hull_pixels(vertices, camera, POSE)
         assert (count[wanted] == 1).all()
@@ -93,7 +93,7 @@ def test_windows_are_not_much_larger_than_the_hull():
     camera = Camera()
     vertices = knot()
     wanted = hull_pixels(vertices, camera, POSE).sum()
-    envelope = PartEnvelope.around(vertices)
+    envelope = PartEnvelope(vertices)
     # 6 % are the envelope's, the rest are corners of the windows
     by_row, by_strip, whole = (
         sum(w.size for w in envelope.windows(camera, POSE, pixels=pixels))
@@ -106,7 +106,7 @@ def test_windows_are_not_much_larger_than_the_hull():
 
 def test_behind_and_beside_the_camera():
     camera = Camera(width=128, height=102)
-    envelope = PartEnvelope.around(knot())
+    envelope = PartEnvelope(knot())
     beside = look_at(np.array([0.0, 0.0, 400.0]), np.array([500.0, 0.0, 0.0]))
     assert envelope.windows(camera, beside, pixels=1000) == []
     among = look_at(np.array([0.0, 0.0, 1.0]), np.zeros(3))

@@ -13,7 +13,7 @@ POSE = look_at(400 * np.array([0.43301, 0.25, 0.86603]), np.array([3.0, -2.0, 1.
 
 
 def view(*, backs: bool = False) -> PixelRays:
-    return PixelRays.of(CAMERA, POSE, start_mm=320.0, farthest_mm=600.0, backs=backs)
+    return PixelRays(CAMERA, POSE, start_mm=320.0, farthest_mm=600.0, backs=backs)
 
 
 def planes_through(points: np.ndarray, normals: np.ndarray) -> np.ndarray:

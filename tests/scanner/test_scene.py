@@ -86,7 +86,7 @@ def test_everything_is_a_closed_solid_with_its_outside_outside(full):
 
 @pytest.mark.parametrize("tilt", [0.0, 8.0])
 def test_the_part_touches_the_table_and_does_not_sink_in(tilt):
-    plate = table(bracket(), size_mm=300.0, tilt_deg=tilt, azimuth_deg=40.0).mesh
+    plate = table(bracket(), tilt_deg=tilt, azimuth_deg=40.0).mesh
     a, b = np.radians([tilt, 40.0])
     normal = np.array([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)])
     top = float(np.max(plate.vertices @ normal))
@@ -154,7 +154,6 @@ def test_drops_sit_on_a_sphere_along_its_normal():
     [
         *[(Clutter, {name: -1}) for name in ("clamps", "chips", "drops")],
         (Clutter, {"tilt_deg": np.nan}),
-        *[(table, {name: 0.0}) for name in ("size_mm", "thickness_mm")],
         (table, {"tilt_deg": 90.0}),
     ],
 )

@@ -116,12 +116,6 @@ class Camera:
         y = (self.cy - 0.5 - np.asarray(rows, np.float64)) / self.fy
         return x, y
 
-    def ray_directions(self, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Unit directions [..., 3] f64, camera frame, of the rays through pixels."""
-        x, y = np.broadcast_arrays(*self.slopes(columns, rows))
-        directions = np.stack([x, y, np.full_like(x, -1.0)], axis=-1)
-        return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-
     def scaled(self, factor: float) -> Camera:
         """The same field of view and clip planes with ``factor`` times the pixels per side."""
         if not 0 < factor < math.inf:

@@ -20,6 +20,7 @@ from vanejax.errors import InputError
 from vanejax.scanner.ideal_scan import Hits
 from vanejax.scanner.virtual_scanner import Scanner
 
+_TABLE_MM = (600.0, 600.0, 20.0)
 _AROUND = 0.25  # of the part's extent: how far from it chips and drops may fall
 _STRIP_STEPS = 16  # sections along a chip
 _RINGS, _SPOKES = 5, 16  # of a drop
@@ -109,29 +110,19 @@ def clutter_scene(part: Part, clutter: Clutter, rng: np.random.Generator) -> Clu
     return ClutterScene(part, objects)
 
 
-def table(
-    part: Part,
-    *,
-    size_mm: float = 600.0,
-    thickness_mm: float = 20.0,
-    tilt_deg: float = 0.0,
-    azimuth_deg: float = 0.0,
-) -> ClutterObject:
+def table(part: Part, *, tilt_deg: float = 0.0, azimuth_deg: float = 0.0) -> ClutterObject:
     """A square plate under the part, which stands in its middle and touches it at its lowest point.
 
     Its normal is tilted by ``tilt_deg`` against +z, towards ``azimuth_deg`` from +x about +z. A
-    plate without size, or tilted by 90 deg or more, raises InputError.
+    tilt of 90 deg or more raises InputError.
     """
-    if not (0 < size_mm < math.inf and 0 < thickness_mm < math.inf and 0 <= tilt_deg < 90):
-        raise InputError(
-            f"a table of {size_mm!r} mm, {thickness_mm!r} mm thick, tilted by {tilt_deg!r} deg: "
-            "lengths must be positive and the tilt from 0 to below 90"
-        )
+    if not 0 <= tilt_deg < 90:
+        raise InputError(f"a table tilted by {tilt_deg!r} deg: the tilt must be from 0 to below 90")
     part_from_plate = Rotation.from_euler("zyz", [-azimuth_deg, tilt_deg, azimuth_deg], True)
     normal = part_from_plate.as_matrix()[:, 2]
     lowest = float(np.min(np.asarray(part.mesh.vertices) @ normal))
-    middle = part.center + (lowest - part.center @ normal - thickness_mm / 2) * normal
-    mesh = trimesh.creation.box((size_mm, size_mm, thickness_mm))
+    middle = part.center + (lowest - part.center @ normal - _TABLE_MM[2] / 2) * normal
+    mesh = trimesh.creation.box(_TABLE_MM)
     vertices = part_from_plate.apply(mesh.vertices) + middle
     return ClutterObject("table", trimesh.Trimesh(vertices, mesh.faces, process=False))
 

@@ -6,7 +6,6 @@ mesh, so that what a view needs to know before it casts rays costs next to nothi
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -46,25 +45,19 @@ class Window(NamedTuple):
         return row, column
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class PartEnvelope:
     """A convex polytope that contains a part with a margin.
 
+    It is what `SIDES` planes that look in all directions leave of space when moved up to the part's
+    vertices, [V, 3] f64, mm, not all the same. Not the convex hull: that may have a corner for
+    every vertex, and fails on a flat part.
+
     Attributes:
-      corners: [P, 3] f64, mm, in the frame of the vertices it was made from.
+      corners: [P, 3] f64, mm, in the frame of the vertices.
       edges: [E, 2] i64, corners at the ends; facets are triangles, so some edges are not sharp.
     """
 
-    corners: np.ndarray
-    edges: np.ndarray
-
-    @classmethod
-    def around(cls, vertices: np.ndarray) -> PartEnvelope:
-        """What `SIDES` planes that look in all directions leave of space when moved up to a part.
-
-        Not the convex hull: that may have a corner for every vertex, and fails on a flat part. The
-        vertices, [V, 3] f64, mm, must not all be the same.
-        """
+    def __init__(self, vertices: np.ndarray) -> None:
         outward = _directions(SIDES)
         inside = vertices.mean(axis=0)
         # about `inside`, which need not be near the origin
@@ -78,7 +71,7 @@ class PartEnvelope:
         met = scipy.spatial.HalfspaceIntersection(halfspaces, np.zeros(3)).intersections
         hull = scipy.spatial.ConvexHull(met)
         ends = np.sort(hull.simplices[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=-1)
-        return cls(corners=met + inside, edges=np.unique(ends, axis=0))
+        self.corners, self.edges = met + inside, np.unique(ends, axis=0)
 
     def windows(
         self, camera: Camera, camera_from_part: RigidTransform, *, pixels: int

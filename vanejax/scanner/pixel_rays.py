@@ -9,8 +9,6 @@ is the part's frame moved to the part's centre.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from vanejax.rigid import RigidTransform
@@ -24,55 +22,37 @@ EDGE_ON_COSINE = 1e-3
 ROWS_AT_ONCE = 1 << 14
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class PixelRays:
-    """The rays of all pixels of one view.
+    """The rays of all pixels of one view, which start in the plane at a depth of ``start_mm``.
 
     Attributes:
       camera: intrinsics; W x H pixels.
       camera_from_local: rotation [3, 3], translation [3] mm, f64.
+      farthest_mm: from the camera to what may be measured, at most.
+      backs: whether faces are seen from their back too.
       x, y: [W] and [H] f64, the rays' coordinates by column and by row.
       starts: [3, 1, W] and [3, H, 1] f32, mm, local: they sum to where the rays start.
       directions: [3, 1, W] and [3, H, 1] f32, local, likewise.
-      farthest_mm: from the camera to what may be measured, at most.
-      backs: whether faces are seen from their back too.
     """
 
-    camera: Camera
-    camera_from_local: RigidTransform
-    x: np.ndarray
-    y: np.ndarray
-    starts: tuple[np.ndarray, np.ndarray]
-    directions: tuple[np.ndarray, np.ndarray]
-    farthest_mm: float
-    backs: bool
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         camera: Camera,
         camera_from_local: RigidTransform,
         *,
         start_mm: float,
         farthest_mm: float,
         backs: bool,
-    ) -> PixelRays:
-        """Rays that start in the plane at a depth of ``start_mm``."""
+    ) -> None:
+        self.camera, self.camera_from_local = camera, camera_from_local
+        self.farthest_mm, self.backs = farthest_mm, backs
         right, up, back = camera_from_local.rotation
         eye = camera_from_local.inverse().translation
-        x, y = camera.slopes(np.arange(camera.width), np.arange(camera.height))
-        across = np.outer(right, x) - back[:, None]
-        down = np.outer(up, y)
-        return cls(
-            camera=camera,
-            camera_from_local=camera_from_local,
-            x=x,
-            y=y,
-            starts=_shares(eye[:, None] + start_mm * across, start_mm * down),
-            directions=_shares(across, down),
-            farthest_mm=farthest_mm,
-            backs=backs,
-        )
+        self.x, self.y = camera.slopes(np.arange(camera.width), np.arange(camera.height))
+        across = np.outer(right, self.x) - back[:, None]
+        down = np.outer(up, self.y)
+        self.starts = _shares(eye[:, None] + start_mm * across, start_mm * down)
+        self.directions = _shares(across, down)
 
     def through(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
         """Starts and directions [N, 3] f32 of a window's rays, row by row."""

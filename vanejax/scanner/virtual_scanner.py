@@ -32,16 +32,15 @@ class Scanner:
     Args:
       part: what to scan.
       surface_samples: number of surface points among which `scan` looks for hidden ones.
-      seed: of those samples.
     """
 
-    def __init__(self, part: Part, *, surface_samples: int = 20_000, seed: int = 0) -> None:
+    def __init__(self, part: Part, *, surface_samples: int = 20_000) -> None:
         self.part = part
-        self._surface_samples, self._seed = surface_samples, seed
+        self._surface_samples = surface_samples
         self._center = np.asarray(part.center, np.float64)
         vertices = np.asarray(part.mesh.vertices, np.float64) - self._center
         self._radius = float(np.linalg.norm(vertices, axis=-1).max())
-        self._envelope = PartEnvelope.around(vertices)
+        self._envelope = PartEnvelope(vertices)
         self._planes = np.empty((len(part.mesh.faces), 4))
         for faces, corners in self._triangles():
             self._planes[faces] = _planes_of(corners)
@@ -156,7 +155,7 @@ class Scanner:
         corners = camera_from_local.apply(self._envelope.corners)
         nearest = -corners[:, 2].max()
         cut_open = nearest < camera.near_mm and self._nearest_mm(camera_from_local) < camera.near_mm
-        return PixelRays.of(
+        return PixelRays(
             camera,
             camera_from_local,
             start_mm=max(camera.near_mm, nearest),
@@ -175,7 +174,7 @@ class Scanner:
     @functools.cached_property
     def _surface(self) -> tuple[np.ndarray, np.ndarray]:
         """Area-uniform points [S, 3] about the part's centre, and their normals [S, 3]; f64."""
-        points, normals, _ = self.part.sample(self._surface_samples, self._seed)
+        points, normals, _ = self.part.sample(self._surface_samples, 0)
         return points - self._center, normals
 
     def _hidden(self, camera: Camera, camera_from_local: RigidTransform) -> np.ndarray:

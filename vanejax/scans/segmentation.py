@@ -101,7 +101,7 @@ def _voxels(points: np.ndarray, part: Part) -> Voxels:
     widest = max(float(np.ptp(points[:, k])) for k in range(3))
     size = max(part.radius / VOXELS_PER_RADIUS, widest / 2**20)
     for _ in range(MAX_VOXEL_STEPS):
-        voxels = Voxels.of(points, size)
+        voxels = Voxels(points, size)
         if len(points) >= POINTS_PER_VOXEL * len(voxels):
             break
         size *= 1.3
@@ -116,7 +116,7 @@ def _part_of(
     sensor_origin: np.ndarray | None,
 ) -> np.ndarray:
     """[N] bool: which of the points [N, 3] are the part, or cannot be told from it."""
-    voxels = Voxels.of(points, size_mm)
+    voxels = Voxels(points, size_mm)
     directions, wanted = _directions(), _part_widths(part)
     piece = voxels.clusters()
     supports = _Supports.of(voxels.middle, piece, directions)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 
@@ -15,42 +14,33 @@ from vanejax.cad.solid_bodies import connected
 CREASE = 0.15  # rad by which the normals of neighbouring voxels turn towards each other
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Voxels:
     """The cubes of a grid that hold at least one of N points; V of them.
 
+    The points are [N, 3] f64, mm, at least one; their extent is at most 2^20 cubes.
+
     Attributes:
+      size_mm: side of a cube.
       cell: [V, 3] i64, in ascending order.
       of_point: [N] i64, index of each point's voxel.
       middle: [V, 3] f64, mm, mean of the points in it.
-      size_mm: side of a cube.
     """
 
-    cell: np.ndarray
-    of_point: np.ndarray
-    middle: np.ndarray
-    size_mm: float
-
-    def __len__(self) -> int:
-        return len(self.cell)
-
-    @classmethod
-    def of(cls, points: np.ndarray, size_mm: float) -> Voxels:
-        """From points [N, 3] f64, mm, at least one; their extent at most 2^20 cubes."""
+    def __init__(self, points: np.ndarray, size_mm: float) -> None:
+        self.size_mm = size_mm
         # column by column: numpy reduces over rows of three at a tenth of the speed
         columns = [np.floor(points[:, k] / size_mm).astype(np.int64) for k in range(3)]
         low = np.array([column.min() for column in columns])
         span = np.array([column.max() for column in columns]) - low + 1
         x, y, z = (column - start for column, start in zip(columns, low, strict=True))
         code = (x * span[1] + y) * span[2] + z
-        names, of_point, count = np.unique(code, return_inverse=True, return_counts=True)
-        total = [np.bincount(of_point, weights=points[:, k]) for k in range(3)]
-        return cls(
-            cell=np.stack(np.unravel_index(names, tuple(span)), axis=1) + low,
-            of_point=of_point,
-            middle=np.stack(total, axis=1) / count[:, None],
-            size_mm=size_mm,
-        )
+        names, self.of_point, count = np.unique(code, return_inverse=True, return_counts=True)
+        self.cell = np.stack(np.unravel_index(names, tuple(span)), axis=1) + low
+        total = [np.bincount(self.of_point, weights=points[:, k]) for k in range(3)]
+        self.middle = np.stack(total, axis=1) / count[:, None]
+
+    def __len__(self) -> int:
+        return len(self.cell)
 
     @functools.cached_property
     def neighbors(self) -> np.ndarray:
