@@ -141,30 +141,21 @@ def test_toward_blends_every_parameter() -> None:
 
 @hypothesis.settings(max_examples=60, deadline=None, derandomize=True)
 @hypothesis.given(
-    scale=st.floats(0.05, 20),
-    exit_angle=st.floats(-76, -60),
-    inlet_angle=st.floats(-20, 20),
-    wedge=st.floats(8, 30),
-    turning=st.floats(1, 15),
-    blockage=st.floats(0.9, 1.05),
+    st.floats(0.05, 20),
+    st.floats(0.9, 1.05),
+    st.fixed_dictionaries(
+        {
+            "exit_angle_deg": st.floats(-76, -60),
+            "inlet_angle_deg": st.floats(-20, 20),
+            "inlet_half_wedge_deg": st.floats(8, 30),
+            "unguided_turning_deg": st.floats(1, 15),
+        }
+    ),
 )
-def test_section_scales_with_its_lengths(
-    scale: float,
-    exit_angle: float,
-    inlet_angle: float,
-    wedge: float,
-    turning: float,
-    blockage: float,
-) -> None:
+def test_section_scales_with_its_lengths(scale: float, blockage: float, angles: dict) -> None:
     """Any parameters make a simple contour or an error; all lengths times s: contour times s."""
-    airfoil = dataclasses.replace(
-        AIRFOIL,
-        exit_angle_deg=exit_angle,
-        inlet_angle_deg=inlet_angle,
-        inlet_half_wedge_deg=wedge,
-        unguided_turning_deg=turning,
-        throat_mm=PITCH_MM * math.cos(math.radians(exit_angle)) * blockage,
-    )
+    throat = PITCH_MM * math.cos(math.radians(angles["exit_angle_deg"])) * blockage
+    airfoil = dataclasses.replace(AIRFOIL, **angles, throat_mm=throat)
     try:
         section = airfoil.section(PITCH_MM)
     except InputError:

@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
+from example_scans import vane
 
-from vanejax.cad import Part, guide_vane, part_from_mesh
+from vanejax.cad import Part, part_from_mesh
 from vanejax.cad.investment_casting import CUT, InvestmentCasting, as_cast, waviness
 from vanejax.errors import InputError
 from vanejax.plotting.casting import casting_map
@@ -31,25 +32,14 @@ def box() -> Part:
 
 def bracket() -> Part:
     """An L: one concave edge between two faces of 25 mm."""
-    flat = np.array([[0, 0], [30, 0], [30, 5], [5, 5], [5, 30], [0, 30]], float)
-    bottom, top = (np.column_stack([flat, np.full(6, z)]) for z in (0.0, 20.0))
-    lid = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
-    walls = [[i, (i + 1) % 6, (i + 1) % 6 + 6] for i in range(6)]
-    walls += [[i, (i + 1) % 6 + 6, i + 6] for i in range(6)]
-    faces = np.concatenate([lid[:, ::-1], lid + 6, np.array(walls)])
-    return part_from_mesh(np.concatenate([bottom, top]), faces, name="bracket")
+    block, corner = ([[0, 0, 0], [30, 30, 20]], [[5, 5, -1], [31, 31, 21]])
+    boxes = [trimesh.creation.box(bounds=bounds) for bounds in (block, corner)]
+    mesh = trimesh.boolean.difference(boxes)
+    return part_from_mesh(mesh.vertices, mesh.faces, name="bracket")
 
 
-@pytest.fixture(scope="module")
-def vane() -> Part:
-    return guide_vane()
-
-
-# --- the offset -----------------------------------------------------------------------------------
-
-
-def test_a_casting_without_errors_is_the_part(vane):
-    assert as_cast(vane, NOTHING, rng()).sha256 == vane.sha256
+def test_a_casting_without_errors_is_the_part():
+    assert as_cast(vane(), NOTHING, rng()).sha256 == vane().sha256
 
 
 @pytest.mark.parametrize("stock_mm", [0.5, -0.5])
@@ -70,9 +60,9 @@ def test_stock_does_not_fold_a_concave_corner():
     assert cast.mesh.is_watertight
 
 
-def test_the_vanes_casting_is_closed_and_within_its_limits(vane):
+def test_the_vanes_casting_is_closed_and_within_its_limits():
     casting = InvestmentCasting()
-    cast = as_cast(vane, casting, rng())
+    cast = as_cast(vane(), casting, rng())
     assert cast.closed
     assert cast.mesh.is_watertight
     assert not cast.notes  # nothing had to be repaired
@@ -80,7 +70,7 @@ def test_the_vanes_casting_is_closed_and_within_its_limits(vane):
     # along the normals, from outside, to the casting and to the CAD model under it
     points, normals, face = cast.sample(4_000, 0)
     origins = points + 5 * normals
-    back = Scanner(vane).cast(origins, -normals).distance_mm
+    back = Scanner(vane()).cast(origins, -normals).distance_mm
     direct = Scanner(cast).cast(origins, -normals)
     free = (direct.face == face) & (back < 6.5)  # nothing in between, and the CAD model's face
     offset = back[free] - 5
@@ -95,9 +85,6 @@ def test_equal_generators_give_equal_bits():
     draws = rng()
     first, second = (as_cast(box(), InvestmentCasting(), draws) for _ in range(2))
     assert first.sha256 == one.sha256 != second.sha256
-
-
-# --- the random field -----------------------------------------------------------------------------
 
 
 def test_the_waviness_has_the_deviation_and_the_correlation_asked_for():
@@ -136,9 +123,6 @@ def test_the_mesh_follows_the_waviness():
     np.testing.assert_allclose(20 - hits.distance_mm, field, atol=0.06 * 0.2)
 
 
-# --- the bow --------------------------------------------------------------------------------------
-
-
 def test_the_bow_bends_the_middle_away_from_the_ends():
     casting = dataclasses.replace(NOTHING, bow_mm=0.8)
     cast = as_cast(box(), casting, rng())
@@ -155,13 +139,10 @@ def test_the_bow_bends_the_middle_away_from_the_ends():
     np.testing.assert_allclose(both.mesh.bounds, waves.mesh.bounds, atol=0.01)
 
 
-# --- what the scanner sees ------------------------------------------------------------------------
-
-
-def test_a_scan_of_the_casting_lies_before_the_cads_by_the_offset(vane):
-    view = hemisphere_viewpoints(vane.center).view(40)
-    plain = Scanner(vane).scan(CAMERA, view)
-    cast = Scanner(as_cast(vane, STOCK, rng())).scan(CAMERA, view)
+def test_a_scan_of_the_casting_lies_before_the_cads_by_the_offset():
+    view = hemisphere_viewpoints(vane().center).view(40)
+    plain = Scanner(vane()).scan(CAMERA, view)
+    cast = Scanner(as_cast(vane(), STOCK, rng())).scan(CAMERA, view)
     _, one, two = np.intersect1d(plain.pixel, cast.pixel, return_indices=True)
     # the same face from both: not beside an edge
     same = np.sum(plain.normals[one] * cast.normals[two], axis=1) > 0.9999
@@ -173,18 +154,15 @@ def test_a_scan_of_the_casting_lies_before_the_cads_by_the_offset(vane):
 
 
 @pytest.mark.slow
-def test_the_map_shows_the_offset(vane):
+def test_the_map_shows_the_offset():
     """Its colour bar spans what was asked for; a uniform one has a scale of its own."""
-    bar = casting_map(vane, as_cast(vane, STOCK, rng())).axes[-1]
+    bar = casting_map(vane(), as_cast(vane(), STOCK, rng())).axes[-1]
     low, high = bar.get_ylim()
     assert low == pytest.approx(0.495, abs=0.01)
     assert high == pytest.approx(0.505, abs=0.01)
     waves = casting_map(box(), as_cast(box(), WAVES, rng())).axes[-1].get_ylim()
     assert waves[0] == -waves[1]
     assert 0.05 < waves[1] < 0.61
-
-
-# --- what cannot be cast --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -5,14 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from example_scans import vane
 from trimesh.triangles import closest_point
 
-from vanejax.cad import NearestFace, Part, guide_vane, part_from_mesh
-
-
-@pytest.fixture(scope="module")
-def vane() -> Part:
-    return guide_vane()
+from vanejax.cad import NearestFace, Part, part_from_mesh
 
 
 @pytest.fixture(scope="module")
@@ -22,12 +18,12 @@ def box() -> Part:
 
 
 @pytest.mark.parametrize("spread_mm", [1e-3, 30.0, 2000.0])
-def test_no_face_is_nearer(vane: Part, spread_mm: float) -> None:
+def test_no_face_is_nearer(spread_mm: float) -> None:
     rng = np.random.default_rng(0)
-    start, _, _ = vane.sample(25, seed=1)
+    start, _, _ = vane().sample(25, seed=1)
     points = start + rng.normal(0, spread_mm, start.shape)
-    closest = NearestFace(vane).closest_points(points)
-    corners = np.asarray(vane.mesh.triangles)
+    closest = NearestFace(vane()).closest_points(points)
+    corners = np.asarray(vane().mesh.triangles)
     for point, foot, face in zip(points, closest.points, closest.face, strict=True):
         every = closest_point(corners, np.broadcast_to(point, (len(corners), 3)))
         least = np.linalg.norm(every - point, axis=1).min()

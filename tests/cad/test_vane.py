@@ -20,6 +20,10 @@ from vanejax.cad import Part
 from vanejax.cad.parametric_vane import DOUBLET, GuideVaneSegment, guide_vane
 from vanejax.errors import InputError
 
+FOLDED = dataclasses.replace(
+    DOUBLET.outer_airfoil, tangential_chord_mm=90.0, inlet_half_wedge_deg=5.0
+)
+
 
 @pytest.fixture(scope="module")
 def part() -> Part:
@@ -135,7 +139,7 @@ def test_same_segment_same_bits(part: Part) -> None:
     assert guide_vane(GuideVaneSegment(fillet_radius_mm=2.4)).sha256 != part.sha256
 
 
-@pytest.mark.parametrize("vanes", [1, 2, 3])
+@pytest.mark.parametrize("vanes", [1, 3])
 def test_number_of_vanes(vanes: int) -> None:
     segment = GuideVaneSegment(vanes=vanes)
     part = guide_vane(segment)
@@ -164,46 +168,28 @@ def test_neighbours_in_the_ring_do_not_overlap(part: Part) -> None:
 @pytest.mark.slow
 @hypothesis.settings(max_examples=15, deadline=None, derandomize=True)
 @hypothesis.given(
-    vanes=st.integers(1, 4),
-    ring=st.integers(44, 60),
-    span_mm=st.floats(25, 70),
-    fillet=st.floats(0, 3.5),
-    slash=st.floats(36, 46),
-    wall=st.floats(-12, 12),
-    thickness=st.floats(1, 6),
-    rail=st.floats(1, 4.5),
-    hook=st.floats(0, 8),
+    st.fixed_dictionaries(
+        {
+            "vanes": st.integers(1, 4),
+            "vanes_per_ring": st.integers(44, 60),
+            "outer_radius_mm": st.floats(300, 345),
+            "fillet_radius_mm": st.floats(0, 3.5),
+            "slash_angle_deg": st.floats(36, 46),
+            "outer_wall_angle_deg": st.floats(-12, 12),
+            "platform_thickness_mm": st.floats(1, 6),
+            "rail_thickness_mm": st.floats(1, 4.5),
+            "hook_length_mm": st.floats(0, 8),
+        }
+    )
 )
-def test_any_segment_is_a_solid_or_refused(
-    vanes: int,
-    ring: int,
-    span_mm: float,
-    fillet: float,
-    slash: float,
-    wall: float,
-    thickness: float,
-    rail: float,
-    hook: float,
-) -> None:
+def test_any_segment_is_a_solid_or_refused(sizes: dict) -> None:
     try:
-        part = guide_vane(
-            GuideVaneSegment(
-                vanes=vanes,
-                vanes_per_ring=ring,
-                outer_radius_mm=275 + span_mm,
-                fillet_radius_mm=fillet,
-                slash_angle_deg=slash,
-                outer_wall_angle_deg=wall,
-                platform_thickness_mm=thickness,
-                rail_thickness_mm=rail,
-                hook_length_mm=hook,
-            )
-        )
+        part = guide_vane(GuideVaneSegment(**sizes))
     except InputError:
         return  # three of four are built
     assert part.mesh.is_watertight
     assert part.mesh.volume > 0
-    assert part.mesh.euler_number == 2 - 2 * (vanes - 1)
+    assert part.mesh.euler_number == 2 - 2 * (sizes["vanes"] - 1)
 
 
 @pytest.mark.parametrize(
@@ -224,16 +210,9 @@ def test_any_segment_is_a_solid_or_refused(
         ({"slash_angle_deg": 0.0}, "slash angle nearer to the stagger"),
         ({"vanes_per_ring": 90}, "throat_mm"),
         ({"inner_airfoil": None}, "inner_airfoil must be an Airfoil"),
+        ({"outer_airfoil": FOLDED}, "crosses itself"),
     ],
 )
 def test_impossible_segments_are_refused(changes: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         guide_vane(GuideVaneSegment(**changes))
-
-
-def test_airfoil_that_crosses_itself_is_refused() -> None:
-    folded = dataclasses.replace(
-        DOUBLET.outer_airfoil, tangential_chord_mm=90.0, inlet_half_wedge_deg=5.0
-    )
-    with pytest.raises(InputError, match="crosses itself"):
-        guide_vane(GuideVaneSegment(outer_airfoil=folded))

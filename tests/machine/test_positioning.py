@@ -177,46 +177,25 @@ def test_jacobians_are_those_of_small_errors(seed):
         np.testing.assert_allclose(np.stack(columns, axis=1), way, atol=5e-3)
 
 
-@pytest.mark.slow
-def test_sigmas_of_the_figures_are_those_of_a_monte_carlo():
+def test_sigmas_of_the_figures_follow_the_motions_error():
+    """By the differences of angle and displacement under each small error of the motion."""
     rng = np.random.default_rng(6)
-    before, machine = pose(rng), pose(rng, 1000.0)
-    axis = np.array([0.0, 0.6, 0.8])
-    turn = Rotation.from_rotvec(np.radians(40) * axis) * Rotation.from_rotvec([0.05, 0, 0])
-    after = before @ RigidTransform(turn.as_matrix(), np.array([5.0, 2, 30])).inverse()
-    place = 500 * rng.standard_normal(3)
-    roots = [
-        rng.standard_normal((6, 6)) * np.repeat([scale, 100 * scale], 3)[:, None]
-        for scale in (2e-4, 1e-4, 3e-4)
-    ]
-    errors = motion_errors(
-        before, after, CENTER, machine_from_camera=machine, calibration_center=place
-    )
-    covariance = errors.covariance(*(root @ root.T for root in roots))
-    found = in_machine(camera_motion(before, after), machine)
-    seen_axis = machine.rotation @ axis
-    start = (machine @ before.inverse()).apply(CENTER[None])[0]
+    motion, axis, step = pose(rng), np.array([0.0, 0.6, 0.8]), 1e-6
+    root = rng.standard_normal((6, 6))
     # what the machine's origin does counts the lever: the printed translation of eq. 13
-    spots = (start, np.zeros(3))
-    angles, shifts = [], ([], [])
-    for _ in range(3000):
-        e = [root @ rng.standard_normal(6) for root in roots]
-        truth = in_machine(
-            camera_motion(small(e[0], CENTER) @ before, small(e[1], CENTER) @ after),
-            small(e[2], place) @ machine,
-        )
-        angles.append(twist_about(truth.rotation, seen_axis).angle_deg)
-        for spot, values in zip(spots, shifts, strict=True):
-            values.append(displacement(truth, spot))
-    # 3,000 draws tell a deviation to 1.3 %
-    assert angle_sigma_deg(covariance, found.rotation, seen_axis) == pytest.approx(
-        np.std(angles), rel=0.06
-    )
-    for spot, values in zip(spots, shifts, strict=True):
-        arrived = spot + displacement(found, spot)
-        expected = displacement_covariance(covariance, errors.center, arrived)
-        drawn = np.cov(np.array(values).T)
-        np.testing.assert_allclose(drawn, expected, atol=0.08 * np.trace(expected))
+    for spot in (CENTER, np.zeros(3)):
+        angles, shifts = [], []
+        for e in step * np.eye(6):
+            ends = [small(side * e, CENTER) @ motion for side in (-1, 1)]
+            twists = [twist_about(end.rotation, axis).angle_deg for end in ends]
+            angles.append(wrapped_deg(twists[1] - twists[0]) / (2 * step))
+            shifts.append((displacement(ends[1], spot) - displacement(ends[0], spot)) / (2 * step))
+        sigma = np.linalg.norm(np.array(angles) @ root)
+        assert angle_sigma_deg(root @ root.T, motion.rotation, axis) == pytest.approx(sigma, 1e-6)
+        arrived = spot + displacement(motion, spot)
+        found = displacement_covariance(root @ root.T, CENTER, arrived)
+        by_differences = np.array(shifts).T @ root
+        np.testing.assert_allclose(found, by_differences @ by_differences.T, rtol=1e-5, atol=1e-3)
 
 
 def test_a_known_frame_and_the_camera_itself():
