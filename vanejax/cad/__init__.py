@@ -6,10 +6,9 @@ and castings of it that differ from the model as investment castings do.
 """
 
 from vanejax.cad.investment_casting import InvestmentCasting, as_cast
-from vanejax.cad.nearest_face import NearestFace
 from vanejax.cad.parametric_vane import GuideVaneSegment, guide_vane
 from vanejax.cad.part import Part, load_part, part_from_mesh
-from vanejax.cad.surface import Surface
+from vanejax.cad.surface import NearestFace, Surface
 from vanejax.cad.triangles import Triangles
 
 __all__ = [

@@ -33,25 +33,17 @@ MAX_ROUNDING_MM = 1e-3  # the scanner's promised range error
 def repair_solid(
     vertices: np.ndarray, faces: np.ndarray, *, name: str
 ) -> tuple[Triangles, tuple[str, ...]]:
-    """One closed solid with outward faces, in an order that depends on the geometry alone.
+    """One closed solid with outward faces, and a sentence per repair.
 
-    Args:
-      vertices: [V, 3] float, mm.
-      faces: [F, 3] integer, counter-clockwise from outside (mended where not).
-      name: what error messages call the part.
-
-    Returns:
-      The solid, and a sentence per repair. Vertices are sorted by x, y, z and faces by their
-      vertices, so that the same geometry gives the same arrays whatever file it came from.
+    Vertices [V, 3] in mm are sorted by x, y, z and faces [F, 3] by their vertices, so that the same
+    geometry gives the same arrays whatever file it came from. Messages call the part ``name``.
 
     Raises:
       InputError: the mesh is empty, not finite, too large, open by more than small holes, not
         orientable, flat, or its bodies cannot be united.
     """
     notes: list[str] = []
-    mesh = _checked(vertices, faces, name)
-    mesh = drop_collapsed(mesh, notes)
-    mesh = drop_doubled(mesh, notes)
+    mesh = drop_doubled(drop_collapsed(_checked(vertices, faces, name), notes), notes)
     if len(mesh.faces):
         mesh = _weld_open_edges(mesh, notes)
     if not len(mesh.faces):
@@ -70,10 +62,9 @@ def repair_solid(
 def open_surface(
     vertices: np.ndarray, faces: np.ndarray, *, name: str
 ) -> tuple[Triangles, tuple[str, ...]]:
-    """The triangles as they are, in the same order as `repair_solid` would give them.
+    """The triangles of a surface that is no solid, in the order of `repair_solid`.
 
-    For surfaces that are no solid: sheets without thickness, models with missing faces. Which side
-    of a face is outside is then unknown.
+    Which side of a face is outside is then unknown.
 
     Raises:
       InputError: the mesh is empty, not finite, or too large.
@@ -200,10 +191,8 @@ def _fill_holes(mesh: Triangles, name: str, notes: list[str]) -> Triangles:
             patch = np.stack([loop, np.roll(loop, -1), np.full(len(loop), size)], axis=1)
             size += 1
         patches.append(patch)
-        if slit:
-            slits += 1
-        else:
-            filled.append(span)
+        slits += slit
+        filled += [] if slit else [span]
     if slits:
         notes.append(f"closed {counted(slits, 'slit')} where edges met without sharing vertices")
     if filled:

@@ -136,7 +136,7 @@ def load_part(
     """Reads a CAD file: STL, OBJ, PLY, GLB, GLTF, or STEP with the extra ``vanejax[step]``.
 
     Args:
-      path: the file; it is only read, nothing is written beside it.
+      path: the file; nothing is written beside it.
       units: the unit of the numbers in the file: mm, cm, m, in, ft or um. GLB and GLTF are in
         metres by their standard, so ``"m"`` unless the exporter broke it. STEP knows its unit:
         `units` must agree with it.

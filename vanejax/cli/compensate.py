@@ -248,7 +248,7 @@ def _tool_path(
     lines = ["", f"tool path: {len(path.points):,} points{axes}, machine frame: {arguments.out}"]
     if part is None:
         return lines
-    from vanejax.cad.nearest_face import NearestFace
+    from vanejax.cad import NearestFace
 
     surface = NearestFace(part)
     programmed = path

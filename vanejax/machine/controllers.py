@@ -8,9 +8,9 @@ controller's words. Millimetres and degrees; host numpy only.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,14 +21,8 @@ from vanejax.machine.pose_file import parse_transform, read_text
 from vanejax.rigid import RigidTransform
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Compensation:
-    """How the part sits, beside how the program takes it to sit.
-
-    Attributes:
-      machine_from_part: where the part is, as measured.
-      nominal_machine_from_part: where the program presumes it.
-    """
+class Compensation(NamedTuple):
+    """Where the part is, as measured, and where the program presumes it."""
 
     machine_from_part: RigidTransform
     nominal_machine_from_part: RigidTransform
@@ -61,12 +55,8 @@ def axis_angle_deg(rotation: np.ndarray) -> tuple[np.ndarray, float]:
 def rounding_error_mm(written: RigidTransform, meant: RigidTransform, radius_mm: float) -> float:
     """How far at most a point moves when ``written`` takes the place of ``meant``.
 
-    ``|dt| + radius |dR|_F / sqrt 2``: the second is the chord 2 sin(angle / 2) at the radius.
-
-    Args:
-      written: as read from text.
-      meant: before rounding.
-      radius_mm: distance from the origin of the part's frame to its farthest point.
+    ``|dt| + radius |dR|_F / sqrt 2``: the second is the chord 2 sin(angle / 2) at the radius, the
+    distance from the origin of the part's frame to its farthest point.
     """
     moved = np.linalg.norm(written.translation - meant.translation)
     chord = np.linalg.norm(written.rotation - meant.rotation) / np.sqrt(2)
@@ -74,12 +64,10 @@ def rounding_error_mm(written: RigidTransform, meant: RigidTransform, radius_mm:
 
 
 def read_frame(path: str | os.PathLike[str], *, target: str, source: str) -> RigidTransform:
-    """The frame target_from_source in a file: of any notation, or JSON by that name.
+    """The frame target_from_source, such as machine_from_part, in a file.
 
-    Args:
-      path: text in a notation of `NOTATIONS`; or JSON with ``{target}_from_{source}`` or its
-        inverse, as `vanejax.machine.pose_file.parse_transform` reads it.
-      target, source: the frames, such as machine and part.
+    It is text in a notation of `NOTATIONS`; or JSON with ``{target}_from_{source}`` or its inverse,
+    as `vanejax.machine.pose_file.parse_transform` reads it.
 
     Raises:
       InputError: the file cannot be read, or holds no frame; names the file and the fault.

@@ -6,11 +6,10 @@ axis points away from the material, along the outward normal. Host numpy, float6
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -26,13 +25,10 @@ MOST_LINES = 2_000  # of a raster: more is a spacing in the wrong unit
 UNIT_TOLERANCE = 0.02  # of an axis' length: files round
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class ToolPath:
-    """Points in the order in which the tool meets them.
+class ToolPath(NamedTuple):
+    """Points [N, 3] f64, mm, in the order in which the tool meets them, and its axes.
 
-    Attributes:
-      points: [N, 3] f64, mm.
-      axes: [N, 3] f64, unit, away from the material; None where nothing is known of them.
+    Axes are [N, 3] f64, unit, away from the material; None where nothing is known of them.
     """
 
     points: np.ndarray
@@ -44,14 +40,8 @@ class ToolPath:
         return ToolPath(motion.apply(self.points), axes)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class PathDeviation:
-    """How points lie to the surface that they should be on.
-
-    Attributes:
-      signed_mm: [N] f64, distance to the surface, positive outside the material.
-      tolerance_mm: what is near enough.
-    """
+class PathDeviation(NamedTuple):
+    """Distances [N] f64 to the surface, positive outside the material, and what is near enough."""
 
     signed_mm: np.ndarray
     tolerance_mm: float
@@ -77,15 +67,11 @@ def compensate(
 ) -> ToolPath:
     """The path in the machine's frame, moved to where the part is.
 
-    Args:
-      path: as programmed.
-      compensation: where the part is, and where the program presumes it.
-      frame: of ``path``. Of the part: it is put there by the measured work frame. Of the machine:
-        it was put there by the nominal work frame, and is moved by the difference.
+    A path in the part's frame is put there by the measured work frame. One in the machine's was put
+    there by the nominal work frame, and is moved by the difference.
     """
-    if frame == "part":
-        return path.moved(compensation.machine_from_part)
-    return path.moved(compensation.in_machine)
+    motion = compensation.machine_from_part if frame == "part" else compensation.in_machine
+    return path.moved(motion)
 
 
 def tool_path_deviation(
@@ -100,8 +86,6 @@ def tool_path_deviation(
     Args:
       points_machine: [N, 3] mm, machine frame.
       surface: the part, or its surface where that was built before.
-      machine_from_part: where the part is.
-      tolerance_mm: what is near enough.
 
     Raises:
       InputError: no points, a coordinate that is not finite, or a tolerance that is not positive.
@@ -131,7 +115,6 @@ def raster_path(
     outward normal there is its axis.
 
     Args:
-      part: what to machine.
       towards: [3], part frame, the way in which the tool advances, any length.
       spacing_mm: between lines, and between points in a line.
       most_tilt_deg: steeper faces are left out.
@@ -174,8 +157,8 @@ def read_tool_path(path: str | os.PathLike[str]) -> ToolPath:
     The columns are named in the first line of the text, or in this order.
 
     Raises:
-      InputError: as `vanejax.scans.point_file.read_points`; or a value that is not finite, or an
-        axis that is not of unit length; names the point.
+      InputError: as `vanejax.scans.point_file.read_points`; or names a point that is not finite,
+        or an axis that is not of unit length.
     """
     path = Path(path)
     if path.suffix.lower() not in TEXT_SUFFIXES:
@@ -206,15 +189,11 @@ def read_tool_path(path: str | os.PathLike[str]) -> ToolPath:
 
 
 def write_tool_path(path: str | os.PathLike[str], tool_path: ToolPath) -> None:
-    """Writes a table that `read_tool_path` reads again: 1e-6 mm, 1e-9 of an axis.
-
-    Raises:
-      InputError: the file cannot be written.
-    """
-    columns, header, formats = tool_path.points, "x,y,z", ["%.6f"] * 3
-    if tool_path.axes is not None:
-        columns = np.concatenate([columns, tool_path.axes], axis=1)
-        header, formats = "x,y,z,i,j,k", formats + ["%.9f"] * 3
+    """Writes a table that `read_tool_path` reads again: 1e-6 mm, 1e-9 of an axis."""
+    with_axes = tool_path.axes is not None
+    columns = np.concatenate(tool_path, axis=1) if with_axes else tool_path.points
+    formats = ["%.6f"] * 3 + ["%.9f"] * (3 * with_axes)
+    header = "x,y,z,i,j,k" if with_axes else "x,y,z"
     text = io.StringIO()
     np.savetxt(text, columns, fmt=formats, delimiter=",", header=header, comments="")
     write_text(path, text.getvalue())
