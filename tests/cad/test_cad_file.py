@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import builtins
 import json
 import os
 import struct
+import sys
 from pathlib import Path
 
 import hypothesis
@@ -140,7 +140,6 @@ ASCII = encoded("stl_ascii").decode()
     [
         ("a.stl", b"", "a.stl: is empty"),
         ("a.ply", b" \n", "a.ply: is empty"),
-        ("a.stl", TEXT, "a.stl: is no STL file"),
         ("a.stl", TEXT * 10, "a.stl: is no STL file"),
         ("a.stl", "solid state physics\n" + TEXT * 10, "without triangles, or another text"),
         ("a.stl", "solid a\nendsolid a\n", "without triangles"),
@@ -244,13 +243,6 @@ def test_a_step_file_without_a_shape_is_refused(tmp_path):
 
 
 def test_step_without_cascadio_names_the_extra(tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def missing(name, *arguments, **options):
-        if name == "cascadio":
-            raise ImportError("No module named 'cascadio'")
-        return real(name, *arguments, **options)
-
-    monkeypatch.setattr(builtins, "__import__", missing)
+    monkeypatch.setitem(sys.modules, "cascadio", None)
     with pytest.raises(InputError, match=r"pip install 'vanejax\[step\]'"):
         read_triangles(write(tmp_path, "corner.step", step("mm")), units="mm")

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
 from vanejax.machine.pose_file import (
-    euler_deg,
     pose_to_dict,
     read_pose,
     result_to_dict,
@@ -48,8 +47,7 @@ def read(tmp_path: Path, content: Any, name: str = "pose.json") -> RigidTransfor
 def test_every_form_of_a_pose_is_the_same_pose(a: float, b: float, c: float) -> None:
     truth = pose((a, b, c), (1.0, -2.0, 300.0))
     found = pose_to_dict(truth)
-    matrix = truth.as_matrix()
-    np.testing.assert_array_equal(found["part_from_camera"], matrix)
+    np.testing.assert_array_equal(found["part_from_camera"], truth.as_matrix())
     np.testing.assert_allclose(
         np.array(found["part_from_camera"]) @ found["camera_from_part"], np.eye(4), **EXACT
     )
@@ -70,14 +68,6 @@ def test_every_form_of_a_pose_is_the_same_pose(a: float, b: float, c: float) -> 
         np.testing.assert_array_equal(forms["translation_mm"], matrix[:3, 3])
         np.testing.assert_array_equal([kuka[i] for i in "XYZ"], matrix[:3, 3])
         assert forms["quaternion_wxyz"][0] >= 0
-
-
-def test_euler_angles_give_the_rotation_back_at_the_lock_too() -> None:
-    angles = [(10, 20, 30), (-170, 80, 100), (20, 90, 30), (20, -90, 30), (180, 0, 180), (0, 0, 0)]
-    for rotation in Rotation.from_euler("xyz", angles, degrees=True).as_matrix():
-        again = Rotation.from_euler("xyz", euler_deg(rotation, "xyz"), degrees=True)
-        np.testing.assert_allclose(again.as_matrix(), rotation, atol=1e-7)
-    assert euler_deg(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), "xyz").tolist() == [0, 90, 0]
 
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
@@ -105,8 +95,6 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     )
     assert values["notes"] == ["2 points were dropped"]
     assert values["seconds"] == {"search": 1.25, "refinement": 0.5}
-    assert "row-major" in values["conventions"]["part_from_camera"]
-    assert "Rz(A) Ry(B) Rx(C)" in values["conventions"]["kuka"]
     assert values["versions"]["numpy"] == np.__version__
     assert list(tmp_path.iterdir()) == [path]
 
@@ -183,23 +171,18 @@ def changed(row: int, column: int, value: Any) -> list[list[Any]]:
     [
         ({"pose": np.eye(4).tolist()}, "no \"part_from_camera\".*has 'pose'"),
         ({}, "it has nothing"),
-        ("[1, 2", "not valid JSON"),
         ("[" * 100_000, "not valid JSON"),
         ("", "holds 0 numbers"),
-        ("1 2 3", "holds 3 numbers"),
         (" ".join(["0"] * 17), "holds 17 numbers"),
         ("hello", "neither JSON nor 16 numbers"),
         ("nan " * 16, "not finite"),
         (np.eye(3).tolist(), "no 4x4 matrix"),
         (changed(0, 3, "1"), "no 4x4 matrix"),
-        (changed(0, 3, None), "no 4x4 matrix"),
         (changed(0, 3, True), "no 4x4 matrix"),
         (changed(0, 3, 10**400), "not finite"),
         ({"part_from_camera": "identity"}, "part_from_camera: holds no 4x4 matrix"),
         (changed(3, 3, 2.0), r"last row is \[0.0, 0.0, 0.0, 2.0\]"),
         (changed(3, 0, 100.0), "column-major: transpose"),
-        (changed(0, 3, float("nan")), "not finite"),
-        (changed(0, 3, float("inf")), "not finite"),
         (changed(0, 0, -1.0), "mirror image"),
         (changed(0, 1, 0.01), "axes are not unit and square.*by 0.01"),
         (changed(0, 0, 1e200), "entry of size 1e[+]200"),
@@ -218,19 +201,18 @@ def test_what_is_no_pose_is_named(tmp_path: Path, content: Any, words: str) -> N
 
 
 def test_what_is_no_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        read_pose(tmp_path / "none.json")
-    with pytest.raises(InputError, match="is a folder"):
-        read_pose(tmp_path)
-    with pytest.raises(InputError, match="or a device"):
-        read_pose("/dev/zero")
     (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\xff\xfe\x00")
-    with pytest.raises(InputError, match="is no text"):
-        read_pose(tmp_path / "picture.png")
     with open(tmp_path / "large.json", "wb") as file:
         file.truncate(1 << 30)
-    with pytest.raises(InputError, match="1024 MiB are too large"):
-        read_pose(tmp_path / "large.json")
+    for name, words in (
+        ("none.json", "no such file"),
+        (".", "is a folder"),
+        ("/dev/zero", "or a device"),
+        ("picture.png", "is no text"),
+        ("large.json", "1024 MiB are too large"),
+    ):
+        with pytest.raises(InputError, match=words):
+            read_pose(tmp_path / name)
 
 
 JSON = st.recursive(
