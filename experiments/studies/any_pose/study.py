@@ -122,13 +122,13 @@ def table(report: dict[str, Any]) -> str:
 def main(settings: argparse.Namespace) -> dict[str, Any]:
     """All attempts, one after the other."""
     views = VaneViews()
-    weights = None
-    if settings.weights != "none":
-        weights = find_weights(settings.weights, views.part)
+    named = settings.weights
+    weights = None if named == "none" else find_weights(named, views.part)
+    given = {"noise_mm": settings.noise_mm, "seed": settings.seed}
     if weights is not None:  # compiles
-        attempt(views, 0, weights, noise_mm=settings.noise_mm, seed=settings.seed)
+        attempt(views, 0, weights, **given)
     rows = [
-        attempt(views, number, weights, noise_mm=settings.noise_mm, seed=settings.seed)
+        attempt(views, number, weights, **given)
         for number in tqdm(range(settings.count), "registering", unit="scan")
     ]
     method = "register, no guess, " + ("no training" if weights is None else "RPM-Net")

@@ -21,7 +21,7 @@ PAPER = {"turns": (0.142, 0.32), "moves": (0.692, 0.85)}  # mean and maximum, Fi
 GOAL = {"turns": 0.05, "moves": 0.1}  # mean, registration and calibration included
 STATUSES = ("accepted", "ambiguous", "rejected")
 PARTS, UNITS = ("pose", "motion"), ("deg", "mm")
-PREDICTED = (canvas.INK, ":", "predicted (one sigma)")
+
 
 # figures of turns and of moves: name in the rows, words, unit
 TURNS = {
@@ -41,6 +41,34 @@ MOVES = {
 SINGLE = {
     "rotation_deg": ("of one registration: rotation", "deg"),
     "translation_mm": ("of one registration: translation", "mm"),
+}
+
+
+# of the picture's panels: title, axis, unit, what the dots are
+PANELS = {
+    "turns": ("(a) angle about the R axis", "turned by (deg)", "deg", "each camera"),
+    "moves": (
+        "(b) translation, against the probe",
+        "moved along X, Y, Z by (mm)",
+        "mm",
+        "against the probe, each camera",
+    ),
+}
+# their lines: colour, line and label of each figure's mean over the cameras
+PREDICTED = (canvas.INK, ":", "predicted (one sigma)")
+LINES = {
+    "turns": {
+        "error_deg": (canvas.SERIES[0], "-", "mean of the cameras"),
+        "whole_deg": (canvas.SERIES[2], "--", "whole rotation, mean of the cameras"),
+        "sigma_deg": PREDICTED,
+    },
+    "moves": {
+        "against_probe_mm": (canvas.SERIES[0], "-", "against the probe, mean"),
+        "against_truth_mm": (canvas.SERIES[2], "--", "against the truth, mean"),
+        "known_frame_mm": (canvas.SERIES[1], "--", "the same with the true frame T_b"),
+        "origin_mm": (canvas.SERIES[3], "--", "eq. 13 as printed (machine's origin)"),
+        "sigma_mm": PREDICTED,
+    },
 }
 
 
@@ -194,70 +222,27 @@ def _frames(report: Report) -> str:
 def picture(report: Report) -> Figure:
     """Fig. 15: errors at every position, the paper's figures, and what was predicted."""
     figure = canvas.new_figure(canvas.WIDTH_IN, 4.2)
-    turned, moved = figure.subplots(1, 2)
-    first, blue = report["cameras"][0], canvas.SERIES[0]
-    _panel(
-        turned,
-        report,
-        "turns",
-        {
-            "error_deg": (blue, "-", "mean of the cameras"),
-            "whole_deg": (canvas.SERIES[2], "--", "whole rotation, mean of the cameras"),
-            "sigma_deg": PREDICTED,
-        },
-        each="each camera",
-        title="(a) angle about the R axis",
-        xlabel="turned by (deg)",
-        ticks=[f"{row['true_deg'] % 360:g}" for row in turns_of(first)],
-    )
-    _panel(
-        moved,
-        report,
-        "moves",
-        {
-            "against_probe_mm": (blue, "-", "against the probe, mean"),
-            "against_truth_mm": (canvas.SERIES[2], "--", "against the truth, mean"),
-            "known_frame_mm": (canvas.SERIES[1], "--", "the same with the true frame T_b"),
-            "origin_mm": (canvas.SERIES[3], "--", "eq. 13 as printed (machine's origin)"),
-            "sigma_mm": PREDICTED,
-        },
-        each="against the probe, each camera",
-        title="(b) translation, against the probe",
-        xlabel="moved along X, Y, Z by (mm)",
-        ticks=["\n".join(f"{v:g}" for v in row["stage_mm"]) for row in moves_of(first)],
-    )
+    first = report["cameras"][0]
+    turns = [f"{row['true_deg'] % 360:g}" for row in turns_of(first)]
+    moves = ["\n".join(f"{v:g}" for v in row["stage_mm"]) for row in moves_of(first)]
+    panels = (("turns", turns_of, turns), ("moves", moves_of, moves))
+    for axes, (kind, rows_of, ticks) in zip(figure.subplots(1, 2), panels, strict=True):
+        title, xlabel, unit, dots = PANELS[kind]
+        errors = compared(report)[kind]
+        title += f"\nmean {errors.mean():.3f}, maximum {errors.max():.3f} {unit}"
+        canvas.style_chart(axes, title=title, xlabel=xlabel, ylabel=f"error ({unit})")
+        axes.set_xticks(range(len(ticks)), ticks)
+        places = np.broadcast_to(np.arange(len(ticks)), errors.shape)
+        axes.plot(
+            places.ravel(), errors.ravel(), "o", color=canvas.SERIES[0], alpha=0.35, markersize=3,
+            label=dots, markeredgewidth=0,
+        )  # fmt: skip
+        for name, (color, line, label) in LINES[kind].items():
+            means = magnitudes(report, rows_of, name).mean(axis=0)
+            axes.plot(means, line, color=color, linewidth=1.2, label=label)
+        _levels(axes, PAPER[kind], GOAL[kind])
+        canvas.add_legend(axes, loc="upper center", bbox_to_anchor=(0.5, -0.27))
     return figure
-
-
-def _panel(
-    axes: Axes,
-    report: Report,
-    kind: str,
-    lines: Mapping[str, tuple[str, str, str]],
-    *,
-    each: str,
-    title: str,
-    xlabel: str,
-    ticks: list[str],
-) -> None:
-    """Errors of turns or moves: dots of every camera, then means over the cameras as lines.
-
-    ``lines`` has the colour, the line and the label of each figure.
-    """
-    errors, unit = compared(report)[kind], "deg" if kind == "turns" else "mm"
-    summary = f"mean {errors.mean():.3f}, maximum {errors.max():.3f} {unit}"
-    canvas.style_chart(axes, title=f"{title}\n{summary}", xlabel=xlabel, ylabel=f"error ({unit})")
-    axes.set_xticks(range(len(ticks)), ticks)
-    places = np.broadcast_to(np.arange(errors.shape[1]), errors.shape)
-    axes.plot(
-        places.ravel(), errors.ravel(), "o", color=canvas.SERIES[0], alpha=0.35, markersize=3,
-        label=each, markeredgewidth=0,
-    )  # fmt: skip
-    for name, (color, line, label) in lines.items():
-        means = magnitudes(report, turns_of if kind == "turns" else moves_of, name).mean(axis=0)
-        axes.plot(means, line, color=color, linewidth=1.2, label=label)
-    _levels(axes, PAPER[kind], GOAL[kind])
-    canvas.add_legend(axes, loc="upper center", bbox_to_anchor=(0.5, -0.27))
 
 
 def _levels(axes: Axes, paper: tuple[float, float], goal: float) -> None:

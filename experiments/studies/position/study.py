@@ -52,20 +52,12 @@ _STAND, _SCAN, _PROBE, _CUBE = range(4)  # folded into the seed
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Found:
-    """One registered position.
+    """One registered position."""
 
-    Attributes:
-      pose: part_from_camera, and ``truth`` what it should be.
-      covariance: [6, 6], as the registration says.
-      bias: [6, K], what each error of the camera's calibration does to it.
-      verdict: of the registration.
-      seconds: it took.
-    """
-
-    pose: RigidTransform
-    truth: RigidTransform
-    covariance: np.ndarray
-    bias: np.ndarray
+    pose: RigidTransform  # part_from_camera
+    truth: RigidTransform  # what it should be
+    covariance: np.ndarray  # [6, 6], as the registration says
+    bias: np.ndarray  # [6, K], what each error of the camera's calibration does to it
     verdict: str
     seconds: float
 
@@ -296,9 +288,8 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     if positions < 3:
         raise InputError(f"--positions {positions}: at least 3 are needed for an axis")
     stage_moves(positions)
-    weights = None
-    if settings.weights is not None:
-        weights = find_weights(settings.weights, views.part)
+    named = settings.weights
+    weights = None if named is None else find_weights(named, views.part)
     method = "ray casting" if weights is None else "RPM-Net, then ray casting"
     given = {"positions": positions, "weights": weights, "seed": settings.seed}
     report = study.header(method, settings, views.part) | {

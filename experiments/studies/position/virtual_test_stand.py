@@ -49,23 +49,14 @@ LEAST_COSINE = 0.2
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class VirtualTestStand:
-    """One camera, one part, one stage, one measuring machine.
+    """One camera, one part, one stage, one measuring machine."""
 
-    Attributes:
-      part: in its own frame.
-      sensor: this camera, with the errors of its calibration.
-      camera_from_part: at the initial position.
-      camera_from_stage: where the stage's axes are, its R axis along z through its origin.
-      nominal_from_stage: the same by the drawing.
-      machine_from_camera: what the calibration should find.
-    """
-
-    part: Part
-    sensor: Sensor
-    camera_from_part: RigidTransform
-    camera_from_stage: RigidTransform
-    nominal_from_stage: RigidTransform
-    machine_from_camera: RigidTransform
+    part: Part  # in its own frame
+    sensor: Sensor  # this camera, with the errors of its calibration
+    camera_from_part: RigidTransform  # at the initial position
+    camera_from_stage: RigidTransform  # the stage's axes: R along z through its origin
+    nominal_from_stage: RigidTransform  # the same by the drawing
+    machine_from_camera: RigidTransform  # what the calibration should find
 
     @classmethod
     def build(
@@ -144,15 +135,12 @@ def stage_moves(positions: int) -> list[RigidTransform]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class GroundCube:
-    """A calibration cube as it was ground: corner at the origin, material at x, y, z < 0.
+    """A calibration cube as it was ground: corner at the origin, material at x, y, z < 0."""
 
-    Attributes:
-      waves: [3, 2, 4] of three faces: length (mm), direction and phase (rad), weight of two waves.
-      lean: [3, 3] what makes the faces not quite square.
-    """
-
-    waves: np.ndarray
-    lean: np.ndarray
+    waves: (
+        np.ndarray
+    )  # [3, 2, 4] of three faces: length (mm), direction, phase (rad), weight of two
+    lean: np.ndarray  # [3, 3], makes the faces not quite square
 
     @classmethod
     def ground(cls, rng: np.random.Generator) -> GroundCube:
@@ -193,15 +181,10 @@ def _height(waves: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 class PlacedCube(NamedTuple):
-    """One placement of the cube, as both instruments have it.
+    """One placement of the cube, as both instruments have it."""
 
-    Attributes:
-      scanned: three arrays [n, 3] mm, camera frame, of the scan's points on each face.
-      touched: three arrays [9, 3] mm, machine frame.
-    """
-
-    scanned: list[np.ndarray]
-    touched: list[np.ndarray]
+    scanned: list[np.ndarray]  # three of [n, 3] mm, camera frame: the scan's points on each face
+    touched: list[np.ndarray]  # three of [9, 3] mm, machine frame
 
 
 def place_cubes(stand: VirtualTestStand, rng: np.random.Generator) -> list[PlacedCube]:

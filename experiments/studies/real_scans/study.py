@@ -41,19 +41,13 @@ NEAR_DEG, NEAR_MM = 3.0, 3.0  # not much more than the truth itself may be off
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KnownScan:
-    """One scan whose pose is known.
-
-    Attributes:
-      scan, cad: files.
-      scan_units, cad_units: of their numbers.
-      camera_from_part: [S, 4, 4] f64, mm, all right answers.
-    """
+    """One scan whose pose is known: files, the units of their numbers, and all right answers."""
 
     scan: Path
     cad: Path
     scan_units: str
     cad_units: str
-    camera_from_part: np.ndarray
+    camera_from_part: np.ndarray  # [S, 4, 4] f64, mm
 
     def points(self, part: Part) -> np.ndarray:
         """[N, 3] f64 mm, camera frame: the scan of ``part``."""
@@ -182,9 +176,8 @@ def table(report: dict[str, Any]) -> str:
         f"time {time_s['median']:.2f} s (median), {time_s['max']:.2f} s (longest)",
     ]
     if report["right"]:
-        lines.insert(
-            -1, f"mean error {mean['rotation_deg']:.2f} deg, {mean['translation_mm']:.2f} mm"
-        )
+        errors = f"{mean['rotation_deg']:.2f} deg, {mean['translation_mm']:.2f} mm"
+        lines.insert(-1, f"mean error {errors}")
     met = (
         report["right"] == report["scans"]
         and not report["accepted_wrong"]

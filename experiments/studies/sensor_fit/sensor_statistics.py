@@ -20,6 +20,7 @@ from vanejax.localization import RayCasting, refine
 from vanejax.rigid import RigidTransform
 from vanejax.scans.robust_statistics import robust_sigma
 
+FOCAL_PX = (150.0, 300.0)  # between which that of the real camera is sought
 EDGE_PX = 2.0
 EDGE_JUMP_MM = 4.0
 MARGIN_PX = 4  # around the points: what lies off the outline is seen there
@@ -56,14 +57,14 @@ class Grid:
         return np.stack(np.broadcast_arrays(x, y, -1.0), axis=-1)
 
 
-def find_grid(scans: Sequence[np.ndarray], *, lowest_px: float, highest_px: float) -> Grid:
+def find_grid(scans: Sequence[np.ndarray]) -> Grid:
     """The grid of square pixels that all scans [N, 3] of one camera lie on.
 
     Slopes times the right focal length are whole numbers plus a phase: the one for which the mean
     of ``exp(2 pi i f x / z)`` is longest.
 
     Raises:
-      InputError: no focal length between the two puts the points on a grid.
+      InputError: no focal length between `FOCAL_PX` puts the points on a grid.
     """
     slopes = np.concatenate([points[:, :2] / -points[:, 2:] for points in scans])
     slopes[:, 1] *= -1
@@ -73,15 +74,15 @@ def find_grid(scans: Sequence[np.ndarray], *, lowest_px: float, highest_px: floa
 
     few = slopes[:: max(1, len(slopes) // 5000)]
     # a focal length wrong by 0.1 px shifts a slope of 0.5 by a twentieth of a pixel
-    coarse = np.arange(lowest_px, highest_px, 0.1)
+    coarse = np.arange(*FOCAL_PX, 0.1)
     best = coarse[np.argmax([np.abs(phases(f, few)).sum() for f in coarse])]
     fine = best + np.arange(-0.2, 0.2, 0.005)
     focal = float(fine[np.argmax([np.abs(phases(f, slopes)).sum() for f in fine])])
     found = phases(focal, slopes)
     if np.abs(found).min() < 0.8:
         raise InputError(
-            f"the scans do not lie on a grid of pixels with a focal length of {lowest_px:g} to "
-            f"{highest_px:g} pixels; the best is {focal:.2f}"
+            f"the scans do not lie on a grid of pixels with a focal length of {FOCAL_PX[0]:g} to "
+            f"{FOCAL_PX[1]:g} pixels; the best is {focal:.2f}"
         )
     column, row = np.angle(found) / (2 * np.pi)
     return Grid(focal, float(column), float(row))
@@ -89,20 +90,14 @@ def find_grid(scans: Sequence[np.ndarray], *, lowest_px: float, highest_px: floa
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Compared:
-    """A scan beside its prediction, in the image around it: arrays [H, W], NaN where nothing is.
+    """A scan beside its prediction, in the image around it: arrays [H, W], NaN where nothing is."""
 
-    Attributes:
-      measured, predicted: depths, mm.
-      incidence_deg: of the predicted surface.
-      edge_px: distance from the nearest jump of the predicted depth, or from the outline; on
-        either side of it.
-      crease_mm: mean predicted depth around a pixel less its own: what a matching window would add.
-    """
-
-    measured: np.ndarray
-    predicted: np.ndarray
-    incidence_deg: np.ndarray
+    measured: np.ndarray  # depth, mm
+    predicted: np.ndarray  # depth, mm
+    incidence_deg: np.ndarray  # of the predicted surface
+    # distance from the nearest jump of the predicted depth, or from the outline; on either side
     edge_px: np.ndarray
+    # mean predicted depth around a pixel less its own: what a matching window would add
     crease_mm: np.ndarray
 
     @property

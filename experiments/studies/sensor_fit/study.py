@@ -43,8 +43,6 @@ from vanejax.scanner import Camera, Sensor, measurement
 from vanejax.scanner.camera import field_of_view_deg
 from vanejax.scanner.sensor import consumer_depth
 
-FOCAL_PX = (150.0, 300.0)  # between which that of the real camera is sought
-WIDTH, HEIGHT = 424, 240
 EFFECTS: dict[str, tuple[str, ...]] = {
     "noise": ("noise_px",),
     "correlated": ("correlated_px",),
@@ -87,19 +85,12 @@ SHOWN = ("Separator_2", "Range_Hood_4")
 
 
 class RealScan(NamedTuple):
-    """One scan, its part, and about where the part stood.
+    """One scan, its part, and about where the part stood."""
 
-    Attributes:
-      name: the file's stem.
-      model: rays from the origin of the scan's frame.
-      camera_from_part: one right answer; a symmetric part has more.
-      points: [N, 3] f64 mm, camera frame.
-    """
-
-    name: str
-    model: RayCasting
-    camera_from_part: RigidTransform
-    points: np.ndarray
+    name: str  # the file's stem
+    model: RayCasting  # rays from the origin of the scan's frame
+    camera_from_part: RigidTransform  # one right answer; a symmetric part has more
+    points: np.ndarray  # [N, 3] f64 mm, camera frame
 
     def compared(self, grid: Grid, points: np.ndarray | None = None) -> Compared:
         """The scan, or other ``points`` of the same part in the same pose, with the prediction."""
@@ -124,15 +115,11 @@ def load(folder: Path) -> list[RealScan]:
     return scans
 
 
-def camera(grid: Grid) -> Camera:
-    """One with the pixels of the grid, and the optical axis in its middle."""
-    return Camera(
-        width=WIDTH,
-        height=HEIGHT,
-        fov_x_deg=field_of_view_deg(WIDTH, grid.focal_px),
-        fov_y_deg=field_of_view_deg(HEIGHT, grid.focal_px),
-        near_mm=50.0,
-    )
+def fitted_camera(grid: Grid) -> Camera:
+    """The depth camera with the pixels of the grid, the optical axis in its middle."""
+    camera = consumer_depth().camera
+    fov_x, fov_y = (field_of_view_deg(n, grid.focal_px) for n in (camera.width, camera.height))
+    return dataclasses.replace(camera, fov_x_deg=fov_x, fov_y_deg=fov_y)
 
 
 def measured_by(scans: Sequence[RealScan], sensor: Sensor, seed: int) -> list[Compared]:
@@ -309,9 +296,9 @@ def picture(scans: Sequence[RealScan], taken: Mapping[str, Sequence[Compared]]) 
 def main(settings: argparse.Namespace) -> dict[str, Any]:
     """The comparison, after a fit if that is wanted."""
     scans = load(settings.folder)
-    grid = find_grid([scan.points for scan in scans], lowest_px=FOCAL_PX[0], highest_px=FOCAL_PX[1])
+    grid = find_grid([scan.points for scan in scans])
     real = [scan.compared(grid) for scan in scans]
-    full = dataclasses.replace(consumer_depth(), camera=camera(grid))
+    full = dataclasses.replace(consumer_depth(), camera=fitted_camera(grid))
     if settings.fit:
         some, wanted = halves(scans)[0], statistics(halves(real)[0])
 

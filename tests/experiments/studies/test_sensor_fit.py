@@ -70,11 +70,11 @@ def on_grid(count: int, seed: int) -> np.ndarray:
 def test_the_grid_of_a_camera_is_found_from_its_points_where_they_have_one():
     # half-precision coordinates, as the real scans have them
     scans = [(on_grid(2000, seed) / 1000).astype(np.float16) * 1000.0 for seed in range(3)]
-    found = find_grid(scans, lowest_px=150, highest_px=300)
+    found = find_grid(scans)
     assert dataclasses.astuple(found) == pytest.approx(dataclasses.astuple(GRID), abs=0.02)
     points = np.random.default_rng(0).uniform(-50, 50, (3000, 3)) - [0, 0, 250]
     with pytest.raises(InputError, match="do not lie on a grid"):
-        find_grid([points], lowest_px=150, highest_px=300)
+        find_grid([points])
 
 
 def test_an_ideal_scan_has_no_residuals_and_no_holes(model):
@@ -209,7 +209,7 @@ def test_values_that_no_sensor_has_are_held_at_the_nearest():
 @pytest.mark.skipif(not REAL.exists(), reason=f"the real scans are not at {REAL}")
 def test_the_fitted_sensor_is_liker_to_real_scans_than_an_ideal_one():
     scans = sensor_fit.load(REAL)[1::5]  # three of both parts, the first two not fitted to
-    grid = find_grid([scan.points for scan in scans], lowest_px=200, highest_px=230)
+    grid = find_grid([scan.points for scan in scans])
     assert grid.focal_px == pytest.approx(consumer_depth().camera.fx, abs=0.05)
     real = [scan.compared(grid) for scan in scans]
     # every pixel is measured once
