@@ -180,14 +180,11 @@ def test_the_target_is_a_subset_of_the_part_s_surface():
     np.testing.assert_allclose(target.normals, surface(SURFACE, seed=99)[1][rows], atol=1e-6)
 
 
-def test_the_same_key_gives_the_same_pair_and_another_one_another():
-    again = draw(jax.random.key(0), bank(), VIEWS, CLEAN)
-    jax.tree.map(np.testing.assert_array_equal, pairs(), jax.tree.map(np.asarray, again))
+def test_another_key_gives_another_pair():
     other = pairs(seed=1)
     assert np.abs(other.target.xyz - pairs().target.xyz).max() > 0.1
     found, compared = other.target_from_source, pairs().target_from_source
-    gaps = np.abs(found.rotation - compared.rotation).max(axis=(1, 2))
-    assert gaps.min() > 1e-3
+    assert np.abs(found.rotation - compared.rotation).max(axis=(1, 2)).min() > 1e-3
     # within a batch too: the same view twice is two draws
     twice = pairs().target_from_source.translation[np.flatnonzero(np.asarray(VIEWS) == 0)]
     assert np.abs(twice[0] - twice[1]).max() > 1e-3

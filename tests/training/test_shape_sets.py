@@ -12,8 +12,6 @@ from vanejax.errors import InputError
 from vanejax.training.generic_solids import make_solids
 from vanejax.training.shape_sets import load_shapes
 
-SUBSET = Path(__file__).parents[3] / "shared" / "data" / "modelnet40_subset.npz"
-
 
 def some_shapes(dtype: type = np.float16) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
@@ -139,14 +137,3 @@ def test_a_folder_of_modelnet40_says_how_much_of_it_is_there(tmp_path: Path):
     assert shapes.names == ("lamp_0001",)
     with pytest.raises(InputError, match="no train shapes of the last 20"):
         load_shapes(str(tmp_path), seed=0, categories="last 20")
-
-
-@pytest.mark.skipif(not SUBSET.exists(), reason=f"the shapes are not at {SUBSET}")
-def test_a_real_file_of_156_shapes():
-    shapes = load_shapes(str(SUBSET), seed=0, num_points=1024)
-    assert shapes.points.shape == (156, 1024, 3)
-    assert len({name.rpartition("_")[0] for name in shapes.names}) == 39
-    np.testing.assert_allclose(np.linalg.norm(shapes.normals, axis=2), 1, atol=1e-6)
-    # outward on the whole: points and normals look the same way on most of a shape's surface
-    outward = np.mean(np.sum(shapes.points * shapes.normals, axis=2), axis=1)
-    assert np.mean(outward > 0) > 0.5
