@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -33,7 +34,7 @@ TETRAHEDRON = "OFF4 4 6\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 0 3 2\n
 
 
 def read(folder: Path, **settings) -> ModelNet40:
-    defaults = {"split": "train", "categories": "all", "seed": 0, "num_points": 64}
+    defaults = {"seed": 0, "num_points": 64}
     return read_modelnet40(folder, **(defaults | settings))
 
 
@@ -53,10 +54,11 @@ def off_tree(tmp_path: Path) -> Path:
 def test_off_meshes_become_samples_in_the_unit_sphere(off_tree: Path):
     found = read(off_tree / "ModelNet40")
     assert found.title == (
-        "ModelNet40 (OFF), train split, all categories: 8 shapes of 8, where 9843 are published"
+        "ModelNet40 (OFF), train split, first 20 categories: 4 shapes of 8, "
+        "where 9843 are published"
     )
-    assert found.names[:3] == ["airplane_0001", "airplane_0002", "lamp_0001"]
-    assert found.samples.shape == (8, 64, 6)
+    assert found.names == ["airplane_0001", "airplane_0002", "lamp_0001", "lamp_0002"]
+    assert found.samples.shape == (4, 64, 6)
     assert found.samples.dtype == np.float32
     points, normals = found.samples[2, :, :3], found.samples[2, :, 3:]
     # the cube's corners are at 1: its sides at 1 / sqrt(3), and its normals along the axes
@@ -69,20 +71,12 @@ def test_off_meshes_become_samples_in_the_unit_sphere(off_tree: Path):
 
 
 def test_a_shape_is_sampled_alike_whatever_others_are_there(off_tree: Path):
-    every, some = read(off_tree), read(off_tree, categories="last 20")
-    np.testing.assert_array_equal(every.samples[4:], some.samples)
+    every = read(off_tree)
     assert np.abs(read(off_tree, seed=1).samples - every.samples).max() > 0.1
     # the same mesh under another name is sampled anew
     assert np.abs(every.samples[0] - every.samples[1]).max() > 0.1
-
-
-def test_halves_are_rpm_net_s_also_in_a_partial_copy(off_tree: Path):
-    first, last = read(off_tree, categories="first 20"), read(off_tree, categories="last 20")
-    assert first.names == ["airplane_0001", "airplane_0002", "lamp_0001", "lamp_0002"]
-    assert last.names == ["laptop_0001", "laptop_0002", "xbox_0001", "xbox_0002"]
-    assert "first 20 categories: 4 shapes of 8," in first.title
-    test = read(off_tree, split="test", categories="first 20")
-    assert test.names == ["airplane_0003", "lamp_0003"]
+    shutil.rmtree(off_tree / "ModelNet40" / "airplane")
+    np.testing.assert_array_equal(read(off_tree).samples, every.samples[2:])
 
 
 STRAY = TETRAHEDRON.replace("OFF4 4 6\n", "OFF 5 4 6\n").replace("3 0 2 1", "900 0 0\n3 0 2 1")
@@ -131,17 +125,15 @@ def test_broken_off_files_are_refused(tmp_path: Path, text: str, message: str):
 
 
 @pytest.mark.parametrize(
-    ("folder", "settings", "message"),
+    ("folder", "message"),
     [
-        ("nowhere", {}, r"no such folder\. Obtain modelnet40_ply.*nothing is downloaded"),
-        ("", {}, "holds no ModelNet40"),
-        ("", {"split": "validation"}, "no split 'validation'"),
-        ("", {"categories": "20"}, "no categories '20'"),
+        ("nowhere", r"no such folder\. Obtain modelnet40_ply.*nothing is downloaded"),
+        ("", "holds no ModelNet40"),
     ],
 )
-def test_what_is_not_there(tmp_path: Path, folder: str, settings: dict, message: str):
+def test_what_is_not_there(tmp_path: Path, folder: str, message: str):
     with pytest.raises(InputError, match=message):
-        read(tmp_path / folder, **settings)
+        read(tmp_path / folder)
 
 
 def test_hdf5_without_h5py_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -179,33 +171,25 @@ def test_hdf5_shapes_are_read_as_stored_in_the_listed_order(hdf5_folder: Path):
     import h5py
 
     found = read(hdf5_folder, num_points=4096)
-    assert found.title.startswith("ModelNet40 (HDF5), train split, all categories: 5 shapes of 5,")
-    categories = ["laptop", "lamp", "xbox", "airplane", "lamp"]
-    expected = [f"{name} train {place}" for place, name in enumerate(categories)]
+    assert "(HDF5), train split, first 20 categories: 3 shapes of 5, where 9840" in found.title
+    expected = ["lamp train 1", "airplane train 3", "lamp train 4"]
     assert found.names == expected
     with h5py.File(hdf5_folder / "ply_data_train0.h5") as file:
-        np.testing.assert_array_equal(found.samples[2:, :, :3], file["data"])
-        np.testing.assert_array_equal(found.samples[2:, :, 3:], file["normal"])
+        np.testing.assert_array_equal(found.samples[1:, :, :3], file["data"][1:])
+        np.testing.assert_array_equal(found.samples[1:, :, 3:], file["normal"][1:])
     # from the folder that holds it, and without the list, in the order of names
     assert read(hdf5_folder.parent).names == expected
     (hdf5_folder / "train_files.txt").unlink()
-    assert read(hdf5_folder).names[0] == "xbox train 0"
+    assert read(hdf5_folder).names[0] == "airplane train 1"
 
 
-def test_hdf5_halves_and_splits(hdf5_folder: Path):
-    every = read(hdf5_folder)
-    first = read(hdf5_folder, categories="first 20")
-    assert first.names == ["lamp train 1", "airplane train 3", "lamp train 4"]
-    assert "3 shapes of 5," in first.title
-    assert read(hdf5_folder, split="test").names == ["airplane test 0"]
-    with pytest.raises(InputError, match="no test shapes of the last 20"):
-        read(hdf5_folder, split="test", categories="last 20")
-    whole = read(hdf5_folder, num_points=100).samples
-    assert every.samples.shape == (5, 64, 6)
-    for some, shape in zip(every.samples, whole, strict=True):
+def test_of_more_points_some_are_taken(hdf5_folder: Path):
+    few, whole = read(hdf5_folder).samples, read(hdf5_folder, num_points=100).samples
+    assert few.shape == (3, 64, 6)
+    for some, shape in zip(few, whole, strict=True):
         rows = [np.flatnonzero((shape == row).all(axis=1)) for row in some]
         assert len(np.unique(np.concatenate(rows))) == 64  # of the shape's own, none twice
-    assert np.abs(every.samples[0] - whole[0, :64]).max() > 0.1  # not just the first
+    assert np.abs(few[0] - whole[0, :64]).max() > 0.1  # not just the first
 
 
 def test_broken_hdf5_folders_are_refused(hdf5_folder: Path):

@@ -1,7 +1,7 @@
 """ModelNet40 as the user has it: the HDF5 files of PointNet, or the tree of OFF meshes.
 
 Nothing is downloaded. Wu et al., 3D ShapeNets (CVPR 2015); RPM-Net (Yew and Lee, CVPR 2020) is
-trained on the first 20 of its 40 categories and tested on the other 20.
+trained on the training split of the first 20 of its 40 categories, and so are networks here.
 """
 
 from __future__ import annotations
@@ -19,10 +19,7 @@ from vanejax.errors import InputError
 from vanejax.training.generic_solids import unit_samples
 
 HDF5_FOLDER, OFF_FOLDER = "modelnet40_ply_hdf5_2048", "ModelNet40"
-# shapes of each split as published, all categories
-PUBLISHED = {"HDF5": {"train": 9840, "test": 2468}, "OFF": {"train": 9843, "test": 2468}}
-# in alphabetical order: RPM-Net's for training, for tests, and all
-CATEGORIES = ("first 20", "last 20", "all")
+PUBLISHED = {"HDF5": 9840, "OFF": 9843}  # shapes of the training split, all categories
 LAST_OF_FIRST_20 = "lamp"  # the next is the laptop: so the half is the same in a partial copy
 MAX_NUMBERS = 2**29  # of one HDF5 dataset, 4 bytes each: a compressed file may promise any size
 MAX_BYTES = 2**29  # of an OFF file; the largest published one has 36 MB
@@ -44,10 +41,8 @@ class ModelNet40(NamedTuple):
     title: str
 
 
-def read_modelnet40(
-    folder: Path, *, split: str, categories: str, seed: int, num_points: int
-) -> ModelNet40:
-    """Reads one split ("train" or "test") of the categories (one of `CATEGORIES`).
+def read_modelnet40(folder: Path, *, seed: int, num_points: int) -> ModelNet40:
+    """Reads the training split of the first 20 categories.
 
     Args:
       folder: ``modelnet40_ply_hdf5_2048`` or ``ModelNet40`` under any name, or what holds it.
@@ -57,24 +52,20 @@ def read_modelnet40(
     Raises:
       InputError: no ModelNet40 is there, or a file cannot be used; the message says which and why.
     """
-    if split not in ("train", "test"):
-        raise InputError(f"no split {split!r} of ModelNet40; there are 'train' and 'test'")
-    if categories not in CATEGORIES:
-        raise InputError(f"no categories {categories!r} of ModelNet40; there are {CATEGORIES}")
     for place in (folder, folder / HDF5_FOLDER, folder / OFF_FOLDER):
-        if any(place.glob("ply_data_*.h5")) or (place / f"{split}_files.txt").is_file():
-            layout, found = "HDF5", _read_hdf5(place, split, categories)
+        if any(place.glob("ply_data_*.h5")) or (place / "train_files.txt").is_file():
+            layout, found = "HDF5", _read_hdf5(place)
         elif any(place.glob("*/*/*.off")):
-            layout, found = "OFF", _read_off_tree(place, split, categories, seed, num_points)
+            layout, found = "OFF", _read_off_tree(place, seed, num_points)
         else:
             continue
         samples, names, size = found
         if not names:
-            raise InputError(f"{place}: holds no {split} shapes of the {categories} categories")
-        published = PUBLISHED[layout][split]
+            raise InputError(f"{place}: holds no train shapes of the first 20 categories")
+        published = PUBLISHED[layout]
         whole = "as published" if size == published else f"where {published} are published"
         title = (
-            f"ModelNet40 ({layout}), {split} split, {categories} categories: {len(names)} "
+            f"ModelNet40 ({layout}), train split, first 20 categories: {len(names)} "
             f"shapes of {size}, {whole}"
         )
         return ModelNet40(thinned(samples, num_points, seed), names, title)
@@ -86,41 +77,36 @@ def read_modelnet40(
     )
 
 
-def _is_chosen(category: str, categories: str) -> bool:
-    first = category <= LAST_OF_FIRST_20
-    return {"first 20": first, "last 20": not first, "all": True}[categories]
-
-
-def _read_hdf5(folder: Path, split: str, categories: str) -> _Read:
+def _read_hdf5(folder: Path) -> _Read:
     categories_file = folder / "shape_names.txt"
     if not categories_file.is_file():
         raise InputError(f"{categories_file}: missing; it names the categories of the labels")
     category_names = categories_file.read_text(encoding="utf-8", errors="replace").split()
     samples, names, size = [], [], 0
-    for path in _hdf5_files(folder, split):
+    for path in _hdf5_files(folder):
         data, labels = _read_hdf5_file(path, len(category_names))
         of = [category_names[label] for label in labels]
-        kept = np.array([_is_chosen(name, categories) for name in of], bool)
+        kept = np.array([name <= LAST_OF_FIRST_20 for name in of], bool)
         samples.append(data[kept])
-        names += [f"{of[i]} {split} {size + i}" for i in np.flatnonzero(kept)]
+        names += [f"{of[i]} train {size + i}" for i in np.flatnonzero(kept)]
         size += len(data)
     if len({part.shape[1] for part in samples}) > 1:
         raise InputError(f"{folder}: the files hold different numbers of points for a shape")
     return np.concatenate(samples), names, size
 
 
-def _hdf5_files(folder: Path, split: str) -> list[Path]:
-    """The files of a split, in the order that `train_files.txt` gives; its paths are another's."""
-    listing = folder / f"{split}_files.txt"
+def _hdf5_files(folder: Path) -> list[Path]:
+    """The files in the order that `train_files.txt` gives, whose paths are another machine's."""
+    listing = folder / "train_files.txt"
     if listing.is_file():
         lines = listing.read_text(encoding="utf-8", errors="replace").split()
         files = [folder / line.replace("\\", "/").rpartition("/")[2] for line in lines]
     else:
-        files = sorted(folder.glob(f"ply_data_{split}*.h5"))
+        files = sorted(folder.glob("ply_data_train*.h5"))
     missing = [path.name for path in files if not path.is_file()]
     if missing or not files:
         raise InputError(
-            f"{folder}: lacks {', '.join(missing) or f'ply_data_{split}*.h5'}; unpack the whole of "
+            f"{folder}: lacks {', '.join(missing) or 'ply_data_train*.h5'}; unpack the whole of "
             f"{HDF5_FOLDER}.zip"
         )
     return files
@@ -169,10 +155,10 @@ def thinned(samples: np.ndarray, num_points: int, seed: int) -> np.ndarray:
     return np.stack([shape[rng.permutation(held)[:num_points]] for shape in samples])
 
 
-def _read_off_tree(folder: Path, split: str, categories: str, seed: int, num_points: int) -> _Read:
+def _read_off_tree(folder: Path, seed: int, num_points: int) -> _Read:
     # beside a mesh, an archive made on a Mac has a file of its own, such as ._lamp_0001.off
-    files = sorted(p for p in folder.glob(f"*/{split}/*.off") if not p.name.startswith("."))
-    kept = [path for path in files if _is_chosen(path.parents[1].name, categories)]
+    files = sorted(p for p in folder.glob("*/train/*.off") if not p.name.startswith("."))
+    kept = [path for path in files if path.parents[1].name <= LAST_OF_FIRST_20]
     samples = np.empty((len(kept), num_points, 6), np.float32)
     for row, path in zip(samples, kept, strict=True):
         # its own seed: a shape is sampled alike whatever others are there

@@ -33,14 +33,7 @@ class ShapeSet:
     sha256: str
 
 
-def load_shapes(
-    where: str,
-    *,
-    seed: int,
-    num_points: int = 4096,
-    split: str = "train",
-    categories: str = "first 20",
-) -> ShapeSet:
+def load_shapes(where: str, *, seed: int, num_points: int = 4096) -> ShapeSet:
     """The shapes that ``where`` stands for.
 
     Args:
@@ -49,7 +42,6 @@ def load_shapes(
         ``points_normals`` [S, P, 6], float16 or float32, in the unit sphere, and ``names`` [S].
       seed: of the solids, of the samples on meshes, and of which points are kept.
       num_points: of each shape, at least 1; fewer where the file holds fewer.
-      split, categories: of a ModelNet40 folder; see `read_modelnet40`.
 
     Raises:
       InputError: nothing of the kind is there, or it cannot be used; the message says why.
@@ -69,10 +61,7 @@ def load_shapes(
         samples, names = _read_npz(path)
         title = f"{len(names)} shapes of the file {path.name}"
         return _shape_set(thinned(samples, num_points, seed), names, title, path)
-    found = read_modelnet40(
-        path, split=split, categories=categories, seed=seed, num_points=num_points
-    )
-    return _shape_set(*found, path)
+    return _shape_set(*read_modelnet40(path, seed=seed, num_points=num_points), path)
 
 
 def _count(text: str, where: str) -> int:
