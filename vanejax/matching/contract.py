@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import flax.struct
 import jax
@@ -21,8 +21,7 @@ class Registration:
       target_from_source: the total motion, the initial guess included.
       converged: [] bool; False also where the answer is not finite or rests on no points.
       iterations: [] i32, iterations done.
-      rmse: [] f32, weighted root mean square distance between moved source points and their
-        partners, in the clouds' unit.
+      rmse: [] f32, weighted, of moved source points to their partners, in the clouds' unit.
       overlap: [] f32, share of the source points that found a partner, 0 to 1.
     """
 
@@ -33,14 +32,9 @@ class Registration:
     overlap: jax.Array
 
 
-class Register(Protocol):
-    """One pair in, one pose out: pure, jit-able and vmap-able."""
-
-    def __call__(
-        self, source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
-    ) -> Registration:
-        """Finds target_from_source, starting at ``init``."""
-        ...
+# One pair in, one pose out: (source, target, init, key) to target_from_source, found from ``init``;
+# pure, jit-able and vmap-able.
+Register = Callable[[PointCloud, PointCloud, RigidTransform, jax.Array], Registration]
 
 
 def chain(coarse: Register, fine: Register) -> Register:
@@ -71,8 +65,7 @@ def from_partners(
     Args:
       source: [N] points.
       target_from_source: the answer.
-      squared: [N] f32, squared distances from the moved points to their partners; of no meaning
-        where the weight is 0.
+      squared: [N] f32, squared distances of moved points to partners; any where the weight is 0.
       weights: [N] f32 or bool, 0 to 1; 0 at padding.
       converged: [] bool.
       iterations: done.
@@ -101,14 +94,9 @@ Iteration = TypeVar("Iteration", bound=Any)  # a flax dataclass with ``target_fr
 def last_iteration(
     iterate: Callable[[RigidTransform], Iteration], init: RigidTransform, *, iterations: int
 ) -> Iteration:
-    """The last of several iterations, each from the ``target_from_source`` of the one before.
+    """The last of several iterations (static, at least 1), each from the pose of the one before.
 
     A loop, not as many copies of the network to compile.
-
-    Args:
-      iterate: one iteration from a target_from_source.
-      init: the pose to start from.
-      iterations: static, at least 1.
     """
     start = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(iterate, init)

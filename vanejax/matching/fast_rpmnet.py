@@ -2,10 +2,7 @@
 
 What does not change is computed once: the reference's features, and the source's neighbours and
 point-pair features, which no rigid motion touches. Layers, normalisation and maxima are fused
-(`vanejax.matching.fused_layers`). All functions take an `RpmNet` for its settings, and its
-variables.
-
-Unlike the plain form it takes clouds without a real point too, and stays finite.
+(`vanejax.matching.fused_layers`). Unlike the plain form it stays finite for clouds without points.
 """
 
 from __future__ import annotations
@@ -18,39 +15,24 @@ import jax
 import jax.numpy as jnp
 
 from vanejax.matching.contract import Register, Registration, from_partners, last_iteration
-from vanejax.matching.features import point_pair_features
 from vanejax.matching.fused_layers import (
     DenseNormRelu,
     DenseNormReluCloudMax,
     DenseNormReluMax,
-    GroupNorm,
-    Linear,
+    NormedLayer,
     norm_relu,
 )
-from vanejax.matching.procrustes import weighted_procrustes
-from vanejax.matching.rpmnet import Match, RpmNet
-from vanejax.matching.sinkhorn import log_sinkhorn, soft_correspondences
-from vanejax.pointcloud import PointCloud, ball_query
+from vanejax.matching.rpmnet import Match, RpmNet, both_clouds, match_features, neighborhoods
+from vanejax.matching.se3 import matmul
+from vanejax.matching.sinkhorn import log_sinkhorn
+from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
-
-
-def neighborhoods(model: RpmNet, cloud: PointCloud) -> jax.Array:
-    """Offsets (neighbour minus point) and point-pair features of a cloud [N]: [N, K, 3 + 4].
-
-    No parameters take part, and the point-pair features stay as they are when the cloud moves.
-    """
-    index = ball_query(
-        cloud.xyz, cloud.mask, radius=model.radius, num_neighbors=model.num_neighbors
-    )
-    offsets = cloud.xyz[index] - cloud.xyz[:, None, :]
-    ppf = point_pair_features(offsets, cloud.normals, cloud.normals[index])
-    return jnp.concatenate([offsets, ppf], -1)
 
 
 def features(model: RpmNet, variables: Mapping[str, Any], cloud: PointCloud) -> jax.Array:
     """Features [M, feature_width] of a cloud: for the reference, once per part."""
     unturned = jnp.eye(3, dtype=cloud.xyz.dtype)
-    return _features(model, variables, cloud.xyz, neighborhoods(model, cloud), unturned, cloud.mask)
+    return _features(model, variables, cloud, neighborhoods(model, cloud), unturned)
 
 
 def match(
@@ -72,30 +54,14 @@ def match(
       target_features: [M, feature_width] f32, from `features`.
       target_from_source: the pose to start from.
     """
-    moved = target_from_source.apply(source.xyz)
-    source_features = _features(
-        model, variables, moved, near, target_from_source.rotation, source.mask
-    )
-    both = jnp.concatenate([source.mask, target.mask])
+    moved = source.replace(xyz=target_from_source.apply(source.xyz))
+    source_features = _features(model, variables, moved, near, target_from_source.rotation)
     beta, alpha = _AnnealingNet().apply(
-        {"params": variables["params"]["annealing_net"]}, moved, target.xyz, both
+        {"params": variables["params"]["annealing_net"]}, *both_clouds(moved, target)
     )
-    # Features have unit length: |f - g|^2 = 2 - 2 f.g
-    distances = 2.0 - 2.0 * jnp.matmul(source_features, target_features.T)
-    log_assignment = log_sinkhorn(
-        -beta * (distances - alpha),
-        source.mask,
-        target.mask,
-        iterations=model.sinkhorn_iterations,
-    )
-    partners, weights = soft_correspondences(jnp.exp(log_assignment), target.xyz)
-    return Match(
-        target_from_source=weighted_procrustes(source.xyz, partners, weights),
-        log_assignment=log_assignment,
-        partners=partners,
-        weights=weights,
-        alpha=alpha,
-        beta=beta,
+    features = source_features, target_features
+    return match_features(
+        source, target, *features, alpha, beta, model.sinkhorn_iterations, log_sinkhorn
     )
 
 
@@ -112,9 +78,7 @@ def last_match(
 ) -> Match:
     """The last of several iterations, at least 1; see `match`.
 
-    Args:
-      near: [N, K, 7], where several starts share them.
-      target_features: [M, feature_width], where several pairs share them.
+    Several starts can share ``near``, and several pairs ``target_features``.
     """
     near = neighborhoods(model, source) if near is None else near
     if target_features is None:
@@ -148,32 +112,26 @@ def rpmnet(model: RpmNet, variables: Mapping[str, Any], *, iterations: int = 5) 
 def _features(
     model: RpmNet,
     variables: Mapping[str, Any],
-    xyz: jax.Array,
+    cloud: PointCloud,
     near: jax.Array,
     rotation: jax.Array,
-    mask: jax.Array,
 ) -> jax.Array:
     """Features [N, width] of a cloud that was moved after its neighbourhoods were found."""
-    net = _FeatureNet(model.feature_width)
-    return net.apply({"params": variables["params"]["feature_net"]}, xyz, near, rotation, mask)
+    net, params = _FeatureNet(model.feature_width), variables["params"]["feature_net"]
+    return net.apply({"params": params}, cloud.xyz, near, rotation, cloud.mask)
 
 
-class _NeighborhoodLayer(nn.Module):
+class _NeighborhoodLayer(NormedLayer):
     """`DenseNormRelu` of ``[xyz, turned offset, ppf]``; what is turned is the kernel."""
-
-    features: int
 
     @nn.compact
     def __call__(
         self, xyz: jax.Array, near: jax.Array, rotation: jax.Array, mask: jax.Array
     ) -> jax.Array:
         """From xyz [N, 3], near [N, K, 7], rotation [3, 3] and mask [N] to [N, K, features]."""
-        kernel, bias = Linear(self.features, name="dense")(10)
-        exact = jax.lax.Precision.HIGHEST  # as wherever points are turned
-        of_offset = jnp.matmul(rotation.T, kernel[3:6], precision=exact)
-        turned = jnp.concatenate([kernel[:3], of_offset, kernel[6:]])
+        kernel, bias, norm = self.parts(10)
+        turned = jnp.concatenate([kernel[:3], matmul(rotation.T, kernel[3:6]), kernel[6:]])
         center = jnp.broadcast_to(xyz[:, None, :], (*near.shape[:2], 3))
-        norm = GroupNorm(self.features, num_groups=8, name="norm")
         return norm_relu(jnp.concatenate([center, near], -1), turned, bias, norm, mask)
 
 
@@ -202,12 +160,8 @@ class _AnnealingNet(nn.Module):
     """`vanejax.matching.rpmnet.AnnealingNet`, the maximum fused with the layer before it."""
 
     @nn.compact
-    def __call__(
-        self, source: jax.Array, target: jax.Array, mask: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """From source [N, 3], target [M, 3] and mask [N + M] to (beta [], alpha [])."""
-        flags = [jnp.zeros_like(source[:, :1]), jnp.ones_like(target[:, :1])]
-        x = jnp.concatenate([jnp.concatenate([source, target]), jnp.concatenate(flags)], -1)
+    def __call__(self, x: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """From `both_clouds` to (beta [], alpha [])."""
         for index, features in enumerate((64, 64, 64, 128)):
             x = DenseNormRelu(features, name=f"prepool_{index}")(x, mask)
         x = DenseNormReluCloudMax(1024, num_groups=16, name="prepool_4")(x, mask)[None, :]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from vanejax.matching.se3 import safe_sqrt
+
 
 def angle_between(a: jax.Array, b: jax.Array) -> jax.Array:
     """Angle in radians, [0, pi], between vectors [..., 3]; 0 where either has no length.
@@ -16,9 +18,7 @@ def angle_between(a: jax.Array, b: jax.Array) -> jax.Array:
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
     x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    squared = x * x + y * y + z * z
-    zero = squared == 0
-    cross = jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+    cross = safe_sqrt(x * x + y * y + z * z)
     dot = ax * bx + ay * by + az * bz
     # A zero vector may give -0.0 here, and atan2(0, -0.0) is pi.
     return jnp.arctan2(cross, jnp.where(dot == 0, 0.0, dot))
@@ -41,9 +41,7 @@ def point_pair_features(
     Source: Drost et al. (2010), in the order of RPM-Net.
     """
     at_point = jnp.expand_dims(normal, -2)
-    squared = jnp.sum(offset**2, -1)
-    zero = squared == 0
-    length = jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+    length = safe_sqrt(jnp.sum(offset**2, -1))
     angles = [
         angle_between(at_point, offset),
         angle_between(neighbor_normal, offset),

@@ -1,9 +1,8 @@
 """Layers for unordered points, aware of padding.
 
-Group normalisation runs over all real points of one cloud and over the channels of a group (Wu and
-He, 2018). It is affine per channel, ``y * scale + shift``, and both follow from the mean and the
-variance of each channel. The layers differ in where they take those from, and in what they spare
-the large [N, K, C] arrays. A mask is applied to what is narrow or already reduced, never to those.
+Group normalisation over all real points of one cloud and the channels of a group (Wu and He, 2018)
+is affine per channel, ``y * scale + shift``; both follow from each channel's mean and variance. The
+layers differ in where they take those from, and in what they spare the large [N, K, C] arrays.
 """
 
 from __future__ import annotations
@@ -12,8 +11,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from vanejax.matching.se3 import matmul
+
 _EPSILON = 1e-5  # PyTorch's default, under which RPM-Net was trained
-_EXACT = jax.lax.Precision.HIGHEST  # for variances, which are differences
 
 
 class Linear(nn.Module):
@@ -29,12 +29,7 @@ class Linear(nn.Module):
 
 
 class GroupNorm(nn.Module):
-    """The affine map that group normalisation amounts to.
-
-    Attributes:
-      features: C, channels.
-      num_groups: must divide the number of channels.
-    """
+    """The affine map that group normalisation of C = ``features`` channels amounts to."""
 
     features: int
     num_groups: int
@@ -67,19 +62,25 @@ class GroupNorm(nn.Module):
         return scale, self.bias + (offset - center) * scale
 
 
-class DenseNormRelu(nn.Module):
-    """A dense layer on every point, group normalisation, ReLU."""
+class NormedLayer(nn.Module):
+    """A dense layer's parameters and its group normalisation, which divides ``features``."""
 
     features: int
     num_groups: int = 8
 
+    def parts(self, channels: int) -> tuple[jax.Array, jax.Array, GroupNorm]:
+        """Kernel [channels, features], bias [features] and the normalisation."""
+        kernel, bias = Linear(self.features, name="dense")(channels)
+        return kernel, bias, GroupNorm(self.features, self.num_groups, name="norm")
+
+
+class DenseNormRelu(NormedLayer):
+    """A dense layer on every point, group normalisation, ReLU."""
+
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array) -> jax.Array:
         """From x [N, C] or [N, K, C] with mask [N] to [..., features]."""
-        kernel, bias = Linear(self.features, name="dense")(x.shape[-1])
-        return norm_relu(
-            x, kernel, bias, GroupNorm(self.features, self.num_groups, name="norm"), mask
-        )
+        return norm_relu(x, *self.parts(x.shape[-1]), mask)
 
 
 def norm_relu(
@@ -100,38 +101,30 @@ def norm_relu(
     return nn.relu(y * scale.reshape(*lead, -1) + shift.reshape(*lead, -1))
 
 
-class DenseNormReluMax(nn.Module):
+class DenseNormReluMax(NormedLayer):
     """`DenseNormRelu`, then the maximum over the neighbours.
 
     The maximum commutes with the normalisation, which is monotone per channel: where it falls, the
     kernel's sign is turned first.
     """
 
-    features: int
-    num_groups: int = 8
-
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array) -> jax.Array:
         """From x [N, K, C] with mask [N] to [N, features]."""
-        kernel, bias = Linear(self.features, name="dense")(x.shape[-1])
-        norm = GroupNorm(self.features, self.num_groups, name="norm")
+        kernel, bias, norm = self.parts(x.shape[-1])
         top, squared = neighbor_sums(product(x, kernel * norm.sign()[None, :]))
         total = product(jnp.sum(x, 1), kernel)
         scale, shift = norm(*_moments_of_sums(total, squared, mask, x.shape[1]), bias)
         return nn.relu(top * jnp.abs(scale)[None, :] + shift[None, :])
 
 
-class DenseNormReluCloudMax(nn.Module):
+class DenseNormReluCloudMax(NormedLayer):
     """`DenseNormRelu`, then the maximum over all points of the cloud."""
-
-    features: int
-    num_groups: int = 8
 
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array) -> jax.Array:
         """From x [N, C] with mask [N] to [features]; 0 where no point is real."""
-        kernel, bias = Linear(self.features, name="dense")(x.shape[-1])
-        norm = GroupNorm(self.features, self.num_groups, name="norm")
+        kernel, bias, norm = self.parts(x.shape[-1])
         scale, shift = norm(*product_moments(x, kernel, mask), bias)
         top = cloud_max(x, kernel * norm.sign()[None, :], mask)
         return nn.relu(top * jnp.abs(scale) + shift)
@@ -151,19 +144,17 @@ def product_moments(
 ) -> tuple[jax.Array, jax.Array]:
     """Mean and variance [C'] of ``x @ kernel`` over real rows, from the moments of x.
 
-    Args:
-      x: [N, C] or [N, K, C].
-      kernel: [C, C'].
-      mask: [N].
+    x is [N, C] or [N, K, C], the kernel [C, C'], the mask [N]. Exact products, since variances are
+    differences.
     """
     real = mask.reshape(-1, *(1,) * (x.ndim - 1))
     rows = jnp.where(real, x, 0.0).reshape(-1, x.shape[-1])
     count = jnp.maximum(jnp.sum(mask), 1) * (rows.shape[0] // x.shape[0])
     mean = jnp.sum(rows, 0) / count
-    second = jnp.matmul(rows.T, rows, precision=_EXACT) / count
+    second = matmul(rows.T, rows) / count
     covariance = second - mean[:, None] * mean[None, :]
-    spread = jnp.matmul(covariance, kernel, precision=_EXACT)
-    return jnp.matmul(mean, kernel, precision=_EXACT), jnp.sum(kernel * spread, 0)
+    spread = matmul(covariance, kernel)
+    return matmul(mean, kernel), jnp.sum(kernel * spread, 0)
 
 
 @jax.custom_vjp
@@ -190,13 +181,9 @@ product.defvjp(_product_forward, _product_backward)
 
 @jax.custom_vjp
 def neighbor_sums(y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Maximum of y and sum of y^2 over the neighbours.
+    """Maximum of y [N, K, C] and sum of y^2 over the neighbours, [N, C] each.
 
-    Args:
-      y: [N, K, C].
-
-    Returns:
-      Two arrays [N, C]. In the gradient equal maxima share alike, as in `jnp.max`.
+    In the gradient equal maxima share alike, as in `jnp.max`.
     """
     return jnp.max(y, 1), jnp.sum(y * y, 1)
 
@@ -221,16 +208,10 @@ neighbor_sums.defvjp(_sums_forward, _sums_backward)
 
 @jax.custom_vjp
 def cloud_max(x: jax.Array, kernel: jax.Array, mask: jax.Array) -> jax.Array:
-    """``max_n (x @ kernel)`` over real rows.
+    """``max_n (x @ kernel)`` [C'] over real rows of x [N, C]; -1e30 where no row is real.
 
-    Args:
-      x: [N, C].
-      kernel: [C, C'].
-      mask: [N].
-
-    Returns:
-      [C'], -1e30 where no row is real. The gradient goes to the last of several equal maxima, and
-      costs the C' winning rows instead of two products of the whole.
+    The gradient goes to the last of several equal maxima, and costs the C' winning rows instead of
+    two products of the whole.
     """
     return _cloud_max_forward(x, kernel, mask)[0]
 

@@ -25,10 +25,7 @@ from vanejax.rigid import RigidTransform
 class SurfaceFit:
     """How closely a registered source lies on its reference; [] f32 each, NaN without points.
 
-    Attributes:
-      rmse_mm: eq. 1, see `rmse`.
-      ffmde_signed_mm: eq. 2 as printed, see `ffmde_signed`.
-      ffmde_abs_mm: eq. 2 with absolute values, see `ffmde_abs`.
+    Equation 1 (`rmse`), equation 2 as printed and with absolute values.
     """
 
     rmse_mm: jax.Array
@@ -41,8 +38,7 @@ class PoseErrors:
     """What separates a found pose from the true one; leading axes as the poses have them.
 
     Attributes:
-      rotation_deg: [...] see `rotation_error_deg`.
-      translation_mm: [...] see `translation_error`.
+      rotation_deg, translation_mm: [...] see `rotation_error_deg` and `translation_error`.
       rotation_axes_deg: [..., 3] f64, |R^(k) - Rt^(k)| for k = x, y, z, the terms of eqs 8 and 10.
         Euler angles about the fixed x, y and z axes, in this order, as the published RPM-Net's
         evaluation takes them; the paper does not say. Differences are wrapped: 0 to 180.
@@ -56,10 +52,7 @@ class PoseErrors:
 
 
 def rotation_error_deg(found: RigidTransform, truth: RigidTransform) -> jax.Array:
-    """Geodesic angle [...] of ``found @ truth.inverse()`` in degrees, 0 to 180.
-
-    The one angle that turns the true attitude into the found one: no choice of axes in it.
-    """
+    """Geodesic angle [...] of ``found @ truth.inverse()`` in degrees, 0 to 180."""
     return jnp.rad2deg(rotation_angle((found @ truth.inverse()).rotation))
 
 
@@ -118,13 +111,8 @@ def mean_per_view(axis_errors: jax.Array) -> jax.Array:
 def nearest_offsets(moved: PointCloud, reference: PointCloud) -> tuple[jax.Array, jax.Array]:
     """From each moved source point x_i to its nearest reference point y_i, as in Fig. 2.
 
-    Args:
-      moved: [N] source, in the reference's frame.
-      reference: [M]; padding is no one's neighbour.
-
-    Returns:
-      ``y_i - x_i`` [N, 3] and the unit normals n_i [N, 3] of the y_i; of no meaning where ``moved``
-      is padding. Without a reference point the offsets are NaN.
+    From ``moved`` [N] in the frame of ``reference`` [M] to ``y_i - x_i`` [N, 3] and the normals n_i
+    [N, 3] of the y_i; of no meaning at padding, offsets are NaN without a reference point.
     """
     # an index has no gradient: this spares the search from being kept for a backward pass
     queries, points = jax.lax.stop_gradient((moved.xyz, reference.xyz))
@@ -178,5 +166,5 @@ def summary(values: np.ndarray) -> dict[str, float | int]:
 
 
 def _mean(values: jax.Array, mask: jax.Array) -> jax.Array:
-    """Mean [] over ``mask``; NaN, not 0, where nothing is there to average."""
+    """Mean [] over ``mask``; NaN where there is nothing to average."""
     return jnp.sum(values, where=mask) / jnp.sum(mask)

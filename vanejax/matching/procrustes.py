@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import jax
 import jax.numpy as jnp
 
@@ -11,7 +9,7 @@ from vanejax.matching.se3 import matmul
 from vanejax.rigid import RigidTransform
 
 
-@functools.partial(jax.custom_jvp)
+@jax.custom_jvp
 def nearest_rotation(matrix: jax.Array) -> jax.Array:
     """The rotation [..., 3, 3] that maximises ``trace(R^T matrix)``: Kabsch's projection on SO(3).
 
@@ -19,8 +17,7 @@ def nearest_rotation(matrix: jax.Array) -> jax.Array:
     out below, since that of the SVD itself is infinite for equal singular values (a sphere) and
     for two vanishing ones (a line), where the rotation is still well defined or harmless.
     """
-    u, _, vt = jnp.linalg.svd(matrix, full_matrices=False)
-    u = u.at[..., :, 2].multiply(jnp.linalg.det(matmul(u, vt))[..., None])
+    u, _, vt = _rotating_svd(matrix)
     return matmul(u, vt)
 
 
@@ -33,18 +30,21 @@ def _nearest_rotation_jvp(primals: tuple[jax.Array], tangents: tuple[jax.Array])
     set to zero there.
     """
     (matrix,), (d_matrix,) = primals, tangents
-    u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
-    sign = jnp.linalg.det(matmul(u, vt))
-    u = u.at[..., :, 2].multiply(sign[..., None])
-    s = s.at[..., 2].multiply(sign)
-    rotation = matmul(u, vt)
+    u, s, vt = _rotating_svd(matrix)
     d = matmul(matmul(jnp.swapaxes(u, -1, -2), d_matrix), jnp.swapaxes(vt, -1, -2))
     skew = d - jnp.swapaxes(d, -1, -2)
     sums = s[..., :, None] + s[..., None, :]
     scale = jnp.finfo(matrix.dtype).eps * 10 * jnp.maximum(s[..., :1, None], 1e-30)
     safe = jnp.abs(sums) > scale
     w = jnp.where(safe, skew / jnp.where(safe, sums, 1.0), 0.0)
-    return rotation, matmul(matmul(u, w), vt)
+    return matmul(u, vt), matmul(matmul(u, w), vt)
+
+
+def _rotating_svd(matrix: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """A singular value decomposition whose ``u @ vt`` turns, the last value with a sign."""
+    u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
+    sign = jnp.linalg.det(matmul(u, vt))
+    return u.at[..., :, 2].multiply(sign[..., None]), s.at[..., 2].multiply(sign), vt
 
 
 def weighted_procrustes(source: jax.Array, target: jax.Array, weights: jax.Array) -> RigidTransform:
@@ -53,8 +53,7 @@ def weighted_procrustes(source: jax.Array, target: jax.Array, weights: jax.Array
     Args:
       source: [..., N, 3] f32.
       target: [..., N, 3] f32, the partner of each source point.
-      weights: [..., N] f32, not negative; zero removes a pair. All zero gives a pure translation
-        of zero and the identity.
+      weights: [..., N] f32, not negative; zero removes a pair, all zero give the identity.
 
     Returns:
       target_from_source, differentiable with finite gradients for planar, linear, coincident and

@@ -12,12 +12,12 @@ This is the network as its paper has it, to be read first. In each iteration
    Procrustes of all partners gives the motion (eqs 8 and 9).
 
 Training and registration use `vanejax.matching.fast_rpmnet`: the same function of the same
-parameters, computed faster. A test holds the two equal.
-
-Coordinates are in unit-sphere units: the part's centre is the origin, its radius is 1.
+parameters, computed faster. Coordinates are in unit-sphere units of the part.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import flax.linen as nn
 import flax.struct
@@ -99,13 +99,8 @@ class AnnealingNet(nn.Module):
     """Predicts the annealing parameters from the two clouds as they lie now."""
 
     @nn.compact
-    def __call__(self, source: PointCloud, target: PointCloud) -> tuple[jax.Array, jax.Array]:
-        """From the moved source [N] and the target [M] to beta [] and alpha [], both positive."""
-        flags = jnp.zeros_like(source.xyz[:, :1]), jnp.ones_like(target.xyz[:, :1])
-        x = jnp.concatenate(
-            [jnp.concatenate(pair) for pair in ((source.xyz, target.xyz), flags)], -1
-        )
-        mask = jnp.concatenate([source.mask, target.mask])
+    def __call__(self, x: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """From `both_clouds` to beta [] and alpha [], both positive."""
         for layer, features in enumerate((64, 64, 64, 128)):
             x = DenseNormRelu(features, name=f"prepool_{layer}")(x, mask)
         x = DenseNormRelu(1024, num_groups=16, name="prepool_4")(x, mask)
@@ -118,11 +113,16 @@ class AnnealingNet(nn.Module):
         return beta, alpha
 
 
+def both_clouds(source: PointCloud, target: PointCloud) -> tuple[jax.Array, jax.Array]:
+    """Two clouds as one: [N + M, 4], xyz and a flag of the target's, and mask [N + M]."""
+    xyz = jnp.concatenate([source.xyz, target.xyz])
+    flags = jnp.concatenate([jnp.zeros_like(source.xyz[:, :1]), jnp.ones_like(target.xyz[:, :1])])
+    return jnp.concatenate([xyz, flags], -1), jnp.concatenate([source.mask, target.mask])
+
+
 @settings_class
 class RpmNetSettings(Settings):
     """What an RPM-Net is made of.
-
-    The settings and the parameters are those of `vanejax.matching.fast_rpmnet` too.
 
     Attributes:
       num_neighbors: K, the paper's k.
@@ -137,6 +137,46 @@ class RpmNetSettings(Settings):
     feature_width: int = multiple_of(8, 96)
 
 
+def neighborhoods(model: RpmNetSettings, cloud: PointCloud) -> jax.Array:
+    """Offsets (neighbour minus point) and point-pair features of a cloud [N]: [N, K, 3 + 4].
+
+    No parameters take part, and the point-pair features stay as they are when the cloud moves.
+    """
+    index = ball_query(
+        cloud.xyz, cloud.mask, radius=model.radius, num_neighbors=model.num_neighbors
+    )
+    offsets = cloud.xyz[index] - cloud.xyz[:, None, :]
+    ppf = point_pair_features(offsets, cloud.normals, cloud.normals[index])
+    return jnp.concatenate([offsets, ppf], -1)
+
+
+def match_features(
+    source: PointCloud,
+    target: PointCloud,
+    source_features: jax.Array,
+    target_features: jax.Array,
+    alpha: jax.Array,
+    beta: jax.Array,
+    iterations: int,
+    normalise: Callable[..., jax.Array],
+) -> Match:
+    """Steps 3 and 4, from features of unit length, by a form of Sinkhorn and its iterations."""
+    # of unit vectors: |f - g|^2 = 2 - 2 f.g
+    distances = 2 - 2 * jnp.matmul(source_features, target_features.T)
+    log_assignment = normalise(
+        -beta * (distances - alpha), source.mask, target.mask, iterations=iterations
+    )
+    partners, weights = soft_correspondences(jnp.exp(log_assignment), target.xyz)
+    return Match(
+        target_from_source=weighted_procrustes(source.xyz, partners, weights),
+        log_assignment=log_assignment,
+        partners=partners,
+        weights=weights,
+        alpha=alpha,
+        beta=beta,
+    )
+
+
 class RpmNet(nn.Module, RpmNetSettings):
     """RPM-Net for one pair; `jax.vmap` over pairs. Its fields are `RpmNetSettings`."""
 
@@ -147,34 +187,19 @@ class RpmNet(nn.Module, RpmNetSettings):
 
     def features(self, cloud: PointCloud) -> jax.Array:
         """Features [N, feature_width] f32 of a cloud [N]."""
-        near = ball_query(
-            cloud.xyz, cloud.mask, radius=self.radius, num_neighbors=self.num_neighbors
-        )
-        center = jnp.broadcast_to(cloud.xyz[:, None, :], (*near.shape, 3))
-        offset = cloud.xyz[near] - center
-        ppf = point_pair_features(offset, cloud.normals, cloud.normals[near])
-        return self.feature_net(jnp.concatenate([center, offset, ppf], -1), cloud.mask)
+        near = neighborhoods(self, cloud)
+        center = jnp.broadcast_to(cloud.xyz[:, None, :], (*near.shape[:2], 3))
+        return self.feature_net(jnp.concatenate([center, near], -1), cloud.mask)
 
     def match(
         self, source: PointCloud, target: PointCloud, target_from_source: RigidTransform
     ) -> Match:
         """One iteration from the pose ``target_from_source``."""
         moved = source.transform(target_from_source)
-        beta, alpha = self.annealing_net(moved, target)
-        # of unit vectors: |f - g|^2 = 2 - 2 f.g
-        distances = 2 - 2 * jnp.matmul(self.features(moved), self.features(target).T)
-        affinity = -beta * (distances - alpha)
-        log_assignment = sinkhorn(
-            affinity, source.mask, target.mask, iterations=self.sinkhorn_iterations
-        )
-        partners, weights = soft_correspondences(jnp.exp(log_assignment), target.xyz)
-        return Match(
-            target_from_source=weighted_procrustes(source.xyz, partners, weights),
-            log_assignment=log_assignment,
-            partners=partners,
-            weights=weights,
-            alpha=alpha,
-            beta=beta,
+        beta, alpha = self.annealing_net(*both_clouds(moved, target))
+        features = self.features(moved), self.features(target)
+        return match_features(
+            source, target, *features, alpha, beta, self.sinkhorn_iterations, sinkhorn
         )
 
     def __call__(
@@ -182,11 +207,7 @@ class RpmNet(nn.Module, RpmNetSettings):
     ) -> list[Match]:
         """All iterations from ``init``, the last one last.
 
-        Args:
-          source: [N] points.
-          target: [M] points, the reference.
-          init: target_from_source to start from.
-          iterations: static; 2 in training, 5 at inference as published.
+        Their number is static; 2 in training, 5 at inference as published.
         """
         matches: list[Match] = []
         for _ in range(iterations):

@@ -15,6 +15,12 @@ def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
 
 
+def safe_sqrt(squared: jax.Array) -> jax.Array:
+    """The root of what is not negative; its gradient at 0 is 0, not infinite."""
+    zero = squared == 0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+
+
 def hat(omega: jax.Array) -> jax.Array:
     """The skew matrix [..., 3, 3] with ``hat(a) @ b == cross(a, b)``."""
     x, y, z = omega[..., 0], omega[..., 1], omega[..., 2]
@@ -73,7 +79,5 @@ def rotation_angle(rotation: jax.Array) -> jax.Array:
     """
     r = rotation
     skew = [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]]
-    squared = jnp.sum(jnp.stack(skew, -1) ** 2, -1)
-    zero = squared == 0
-    sine = jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+    sine = safe_sqrt(jnp.sum(jnp.stack(skew, -1) ** 2, -1))
     return jnp.arctan2(sine, jnp.trace(rotation, axis1=-2, axis2=-1) - 1)

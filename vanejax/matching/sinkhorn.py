@@ -5,6 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from vanejax.matching.se3 import matmul
+
 # A round changes the sums by a factor of at most N + 1, so that this many stay within f32's range.
 _ROUNDS = 5
 
@@ -19,12 +21,11 @@ def sinkhorn(
 
     Args:
       affinity: [N, M] f32, larger for better partners.
-      source_mask: [N] bool.
-      target_mask: [M] bool.
+      source_mask, target_mask: [N] and [M] bool.
       iterations: rounds of one row and one column normalisation.
 
     Returns:
-      log assignment [N, M] f32. Its exponential has rows and columns that sum to at most 1. At
+      log assignment [N, M] f32. Its exponential has rows and columns that sum to at most 1; at
       padding it is finite and very negative, its exponential exactly zero.
     """
     # exp(-1e9) is exactly 0 in f32, and unlike -inf it never makes a NaN in a gradient.
@@ -48,16 +49,15 @@ def log_sinkhorn(
     ``E = exp(A - u - v)`` is taken now and then, and a sum is the product of E with a vector.
     """
     affinity = jnp.where(source_mask[:, None] & target_mask[None, :], affinity, -1e9)
-    # The largest entry of each row becomes 1: what underflows is nothing beside the slack.
+    # the largest entry of each row becomes 1: what underflows is nothing beside the slack.
     u = jax.lax.stop_gradient(jnp.maximum(jnp.max(affinity, axis=1), 0.0))
     v = jnp.zeros_like(affinity[0])
-    exact = jax.lax.Precision.HIGHEST  # TF32 on a GPU would leave rows that sum to 1.001
     for first in range(0, iterations, _ROUNDS):
         scaled = jnp.exp(affinity - u[:, None] - v[None, :])
         row_slack, column_slack, columns = jnp.exp(-u), jnp.exp(-v), jnp.ones_like(v)
         for _ in range(min(_ROUNDS, iterations - first)):
-            rows = row_slack + jnp.matmul(scaled, 1 / columns, precision=exact)
-            columns = column_slack + jnp.matmul(1 / rows, scaled, precision=exact)
+            rows = row_slack + matmul(scaled, 1 / columns)
+            columns = column_slack + matmul(1 / rows, scaled)
         u, v = u + jnp.log(rows), v + jnp.log(columns)
     return affinity - u[:, None] - v[None, :]
 
@@ -67,14 +67,9 @@ def soft_correspondences(
 ) -> tuple[jax.Array, jax.Array]:
     """The weighted mean partner of each source point, and how much it is to be trusted.
 
-    Args:
-      assignment: [N, M] f32, not negative.
-      target_xyz: [M, 3] f32.
-
-    Returns:
-      partners [N, 3] f32 in the target's frame and weights [N] f32, the row sums.
+    From an assignment [N, M] f32, not negative, and target_xyz [M, 3] f32 to partners [N, 3] f32 in
+    the target's frame and weights [N] f32, the row sums.
     """
     weights = jnp.sum(assignment, axis=1)
-    # 1e-5 as published: it keeps rows of no weight finite and shrinks weak ones towards 0.
-    partners = jnp.matmul(assignment, target_xyz, precision=jax.lax.Precision.HIGHEST)
-    return partners / (weights[:, None] + 1e-5), weights
+    # 1e-5 as published: it keeps rows of no weight finite and shrinks weak ones towards 0
+    return matmul(assignment, target_xyz) / (weights[:, None] + 1e-5), weights

@@ -1,11 +1,9 @@
 """DGCNN: features of points from the shape around them (Wang et al., ACM ToG 2019), as in DCP.
 
-DCP's published code builds the graph once, from coordinates, and keeps it for all layers; the
-original DGCNN builds it anew from the features of each layer. Each edge carries the neighbour's
-and the point's own coordinates, not their difference. Published convolutions have no bias and are
-followed by batch normalisation; here it is group normalisation over the real points of one cloud
-(`vanejax.matching.fused_layers`), for which a bias is no redundancy: it has one. A cloud's features
-then depend on neither the batch nor a running average.
+DCP's published code builds the graph once, from coordinates, for all layers; the original DGCNN
+builds it anew in each. Each edge carries the neighbour's and the point's own coordinates, not their
+difference. Published layers have no bias and batch normalisation; here it is group normalisation
+(`vanejax.matching.fused_layers`), for which a bias is no redundancy.
 """
 
 from __future__ import annotations
@@ -17,8 +15,7 @@ import jax.numpy as jnp
 from vanejax.matching.fused_layers import (
     DenseNormRelu,
     DenseNormReluMax,
-    GroupNorm,
-    Linear,
+    NormedLayer,
     neighbor_sums,
     product,
     product_moments,
@@ -29,13 +26,8 @@ from vanejax.pointcloud import squared_distances
 def neighbor_graph(xyz: jax.Array, mask: jax.Array, *, num_neighbors: int) -> jax.Array:
     """Each point's nearest real points, itself among them.
 
-    Args:
-      xyz: [N, 3] f32, any unit.
-      mask: [N] bool; padding is no one's neighbour.
-      num_neighbors: K; in a cloud with fewer points the point itself fills the places left over.
-
-    Returns:
-      indices [N, K] i32, the nearest first, the lower index first among equals; min(K, N) columns.
+    From xyz [N, 3] and mask [N] to indices [N, min(K, N)] i32, the nearest first, the lower index
+    first among equals. In a cloud of fewer than K points the point itself fills what is left over.
     """
     away = jnp.where(mask[None, :], squared_distances(xyz, xyz), jnp.inf)
     negative, index = jax.lax.top_k(-away, min(num_neighbors, len(xyz)))
@@ -43,20 +35,17 @@ def neighbor_graph(xyz: jax.Array, mask: jax.Array, *, num_neighbors: int) -> ja
     return jnp.where(jnp.isfinite(negative), index, itself[:, None])
 
 
-class EdgeLayer(nn.Module):
+class EdgeLayer(NormedLayer):
     """`DenseNormRelu` on every edge, and its maximum over the neighbours.
 
     The maximum is that of the bare product. Of the activations, which XLA may compute anew for the
     backward pass and round otherwise, none might then equal it: a gradient of 0 / 0.
     """
 
-    features: int
-
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
         """From x [N, K, C] with mask [N] to edges [N, K, features] and points [N, features]."""
-        kernel, bias = Linear(self.features, name="dense")(x.shape[-1])
-        norm = GroupNorm(self.features, num_groups=8, name="norm")
+        kernel, bias, norm = self.parts(x.shape[-1])
         scale, shift = norm(*product_moments(x, kernel, mask), bias)
         y = product(x, kernel * scale[None, :])
         top, _ = neighbor_sums(y)
@@ -86,7 +75,7 @@ class Dgcnn(nn.Module):
         for layer, features in enumerate(self.edge_widths[:-1]):
             x, top = EdgeLayer(features, name=f"edge_{layer}")(x, mask)
             tops.append(top)
-        last = len(self.edge_widths) - 1
         # no layer needs this one's edges: its maximum is taken before the normalisation
-        tops.append(DenseNormReluMax(self.edge_widths[-1], name=f"edge_{last}")(x, mask))
+        last = DenseNormReluMax(self.edge_widths[-1], name=f"edge_{len(self.edge_widths) - 1}")
+        tops.append(last(x, mask))
         return DenseNormRelu(self.width, name="point")(jnp.concatenate(tops, -1), mask)
