@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import builtins
 import collections
-import functools
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from published_rpmnet import state_dict
 
 from vanejax.cli.program import main
 from vanejax.errors import InputError, MissingExtra
@@ -19,28 +19,6 @@ from vanejax.files import read_arrays, write_arrays
 from vanejax.matching.torch_weights import load_state_dict, rpmnet_variables
 
 ARRAYS = {"a.weight": np.arange(6.0, dtype=np.float32).reshape(2, 3), "n": np.array(4)}
-
-
-@functools.cache
-def published_rpmnet() -> dict[str, np.ndarray]:
-    """A state dict of the published network's names and shapes, of random values."""
-    rng = np.random.default_rng(0)
-    state: dict[str, np.ndarray] = {}
-    for net, label, widths in (
-        ("feat_extractor", "prepool", (10, 96, 96, 192)),
-        ("feat_extractor", "postpool", (192, 192, 96, 96)),
-        ("weights_net", "prepool", (4, 64, 64, 64, 128, 1024)),
-        ("weights_net", "postpool", (1024, 512, 256, 2)),
-    ):
-        for index in range(len(widths) - 1):
-            name, width = f"{net}.{label}.{3 * index}", widths[index + 1]
-            state[f"{name}.weight"] = rng.normal(size=(width, widths[index])).astype(np.float32)
-            state[f"{name}.bias"] = rng.normal(size=width).astype(np.float32)
-            if label == "prepool" or index < len(widths) - 2:
-                norm = f"{net}.{label}.{3 * index + 1}"
-                state[f"{norm}.weight"] = rng.normal(size=width).astype(np.float32)
-                state[f"{norm}.bias"] = rng.normal(size=width).astype(np.float32)
-    return state
 
 
 def assert_equal(found: dict[str, np.ndarray], wanted: dict[str, np.ndarray]) -> None:
@@ -86,7 +64,7 @@ def test_without_torch_the_extra_is_named(tmp_path: Path, monkeypatch) -> None:
 
 def test_the_command_converts_a_state_dict_once(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    state = published_rpmnet()
+    state = state_dict()
     other_toolbox = {k.replace("feat_extractor", "feature_model"): v for k, v in state.items()}
     np.savez("trained.npz", **other_toolbox)
     assert main(["export", "trained.npz"]) == 0

@@ -24,23 +24,27 @@ from vanejax.errors import InputError, MissingExtra
 from vanejax.files import read_arrays, write_arrays
 
 FORMAT = "vanejax state dict"
+_RPMNET = (  # the network here and as published, and the channels of its parts
+    ("feature_net", "feat_extractor", "prepool", (10, 96, 96, 192)),
+    ("feature_net", "feat_extractor", "postpool", (192, 192, 96, 96)),
+    ("annealing_net", "weights_net", "prepool", (4, 64, 64, 64, 128, 1024)),
+    ("annealing_net", "weights_net", "postpool", (1024, 512, 256, 2)),
+)
 
 
 def load_state_dict(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """Reads a state dict: a PyTorch checkpoint, or arrays of the same names (safetensors, .npz).
 
-    The contents decide, not the suffix (.pth, .pt, .t7, .tar, .safetensors, .npz). In a checkpoint
-    that holds more than the weights, the model is the mapping under ``state_dict``,
-    ``model_state_dict`` or ``model``, the first of these with tensors in it, else the top level.
-    Entries that are no tensors are left out. The prefix ``module.`` (``torch.nn.DataParallel``)
-    goes where every name has it.
+    The contents decide, not the suffix. In a checkpoint that holds more than the weights, the model
+    is the mapping under ``state_dict``, ``model_state_dict`` or ``model``, the first of these with
+    tensors in it, else the top level. Entries that are no tensors are left out, and so is the
+    prefix ``module.`` (``torch.nn.DataParallel``) where every name has it.
 
     Returns:
       Arrays by name in PyTorch's layout ([out, in] for a linear layer); bfloat16 becomes float32.
 
     Raises:
-      InputError: the file is missing, damaged, or holds no tensors or more than tensors and plain
-        values.
+      InputError: the file is missing, damaged, or holds no tensors or more than plain values.
       MissingExtra: a PyTorch file, but torch is not installed.
     """
     path = Path(path)
@@ -105,11 +109,7 @@ def _read_checkpoint(path: Path) -> dict[str, np.ndarray]:
         ) from error
     scalar = np._core.multiarray.scalar
     # scores and options stand beside the weights in published checkpoints
-    harmless = [
-        argparse.Namespace,
-        np.dtype,
-        *(type(np.dtype(kind)) for kind in ("f8", "f4", "i8")),
-    ]
+    harmless = [argparse.Namespace, np.dtype, *(type(np.dtype(k)) for k in ("f8", "f4", "i8"))]
     harmless += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
     try:
         with torch.serialization.safe_globals(harmless), warnings.catch_warnings():
@@ -140,41 +140,23 @@ def _read_checkpoint(path: Path) -> dict[str, np.ndarray]:
 def rpmnet_variables(state_dict: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Flax variables of the published RPM-Net's PyTorch weights.
 
-    Args:
-      state_dict: name to array, as `load_state_dict` reads it.
-
     Raises:
       InputError: a name is missing or unknown, a shape is not RPM-Net's, a value not finite.
     """
     # learning3d names the first network feature_model
     names = {name: name.replace("feature_model.", "feat_extractor.", 1) for name in state_dict}
     weights = _StateDict({names[name]: state_dict[name] for name in state_dict}, "RPM-Net")
-
-    def mlp(prefix: str, label: str, widths: tuple[int, ...], *, normed_last: bool) -> dict:
-        layers: dict[str, Any] = {}
+    params: dict[str, Any] = {"feature_net": {}, "annealing_net": {}}
+    for net, prefix, label, widths in _RPMNET:
         for index, (channels, features) in enumerate(itertools.pairwise(widths)):
-            # torch.nn.Sequential numbers the convolution, its norm and its ReLU: steps of three.
+            # torch.nn.Sequential numbers the convolution, its norm and its ReLU: steps of three
             dense, norm = (f"{prefix}.{label}.{3 * index + offset}" for offset in (0, 1))
-            layer = {
-                "kernel": weights.take(f"{dense}.weight", features, channels).T,
-                "bias": weights.take(f"{dense}.bias", features),
-            }
-            if normed_last or index < len(widths) - 2:
-                scale = weights.take(f"{norm}.weight", features)
-                bias = weights.take(f"{norm}.bias", features)
-                layer = {"dense": layer, "norm": {"scale": scale, "bias": bias}}
-            layers[f"{label}_{index}"] = layer
-        return layers
-
-    def net(prefix: str, prepool: tuple[int, ...], postpool: tuple[int, ...]) -> dict[str, Any]:
-        return mlp(prefix, "prepool", prepool, normed_last=True) | mlp(
-            prefix, "postpool", postpool, normed_last=False
-        )
-
-    params = {
-        "feature_net": net("feat_extractor", (10, 96, 96, 192), (192, 192, 96, 96)),
-        "annealing_net": net("weights_net", (4, 64, 64, 64, 128, 1024), (1024, 512, 256, 2)),
-    }
+            kernel, bias = weights.linear(dense, channels, features)
+            layer: dict[str, Any] = {"kernel": kernel, "bias": bias}
+            if label == "prepool" or index < len(widths) - 2:
+                scale, shift = (weights.take(f"{norm}.{x}", features) for x in ("weight", "bias"))
+                layer = {"dense": layer, "norm": {"scale": scale, "bias": shift}}
+            params[net][f"{label}_{index}"] = layer
     weights.check_empty()
     return jax.tree.map(np.float32, {"params": params})
 
@@ -183,9 +165,6 @@ def pointnetlk_variables(state_dict: Mapping[str, np.ndarray]) -> dict[str, Any]
     """Flax variables of a published PointNetLK's PyTorch weights.
 
     Its batch normalisation, in evaluation, is affine and goes into the kernels.
-
-    Args:
-      state_dict: name to array, as `load_state_dict` reads it.
 
     Raises:
       InputError: a name is missing or unknown, a shape is not PointNetLK's, a value not finite, a
@@ -197,8 +176,7 @@ def pointnetlk_variables(state_dict: Mapping[str, np.ndarray]) -> dict[str, Any]
     encoder: dict[str, np.ndarray] = {}
     for index, (channels, features) in enumerate(itertools.pairwise((3, 64, 64, 64, 128, 1024))):
         convolution, norm = (f"feature_model.{kind}{index + 1}" for kind in ("conv", "bn"))
-        kernel = weights.take(f"{convolution}.weight", features, channels).T
-        bias = weights.take(f"{convolution}.bias", features)
+        kernel, bias = weights.linear(convolution, channels, features)
         gain, shift, mean, variance = (
             weights.take(f"{norm}.{name}", features)
             for name in ("weight", "bias", "running_mean", "running_var")
@@ -232,6 +210,11 @@ class _StateDict:
         if not np.isfinite(value).all():
             raise InputError(f"{name!r} holds values that are not finite: its training diverged")
         return value.reshape(shape)
+
+    def linear(self, name: str, channels: int, features: int) -> tuple[np.ndarray, np.ndarray]:
+        """Kernel [channels, features] and bias [features] of a linear layer or a convolution."""
+        weight = self.take(f"{name}.weight", features, channels)
+        return weight.T, self.take(f"{name}.bias", features)
 
     def check_empty(self) -> None:
         """Refuses arrays that the network does not have."""

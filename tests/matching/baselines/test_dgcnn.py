@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from network_clouds import scattered
 
 from vanejax.matching.baselines.dgcnn import Dgcnn, neighbor_graph
 
@@ -34,14 +35,6 @@ def xyz() -> np.ndarray:
 
 
 run = jax.jit(lambda params, xyz, mask: MODEL.apply({"params": params}, xyz, mask))
-
-
-def padded(xyz: np.ndarray, rows: int, junk: float) -> tuple[np.ndarray, np.ndarray]:
-    """Padding lies scattered among the real points."""
-    place = np.sort(np.random.default_rng(2).permutation(rows)[: len(xyz)])
-    full = np.full((rows, 3), junk)
-    full[place] = xyz
-    return full, np.isin(np.arange(rows), place)
 
 
 def slow_layer(x: np.ndarray, layer: dict) -> np.ndarray:
@@ -73,14 +66,14 @@ def test_it_is_the_slow_twin(params, xyz):
 
 @pytest.mark.parametrize("junk", [0.0, 1e3])
 def test_padding_changes_nothing(params, xyz, junk):
-    full, mask = padded(xyz, N + 13, junk)
+    full, mask = scattered(xyz, N + 13, junk)
     found = run(params, full, mask)
     np.testing.assert_allclose(found[mask], run(params, xyz, np.ones(N, bool)), atol=EXACT)
     assert np.isfinite(found).all()
 
 
 def test_no_gradient_reaches_padding(params, xyz):
-    full, mask = padded(xyz, N + 13, 0.1)
+    full, mask = scattered(xyz, N + 13, 0.1)
 
     @jax.jit
     def gradient(full):
@@ -93,14 +86,8 @@ def test_no_gradient_reaches_padding(params, xyz):
     assert np.abs(found[mask]).max(axis=1).min() > 0
 
 
-def test_points_in_another_order_have_their_features_in_that_order(params, xyz):
-    order = np.random.default_rng(3).permutation(N)
-    plain = run(params, xyz, np.ones(N, bool))
-    np.testing.assert_allclose(run(params, xyz[order], np.ones(N, bool)), plain[order], atol=EXACT)
-
-
 def test_neighbours_are_the_nearest_real_points_itself_first(xyz):
-    full, mask = padded(xyz, N + 13, 0.0)
+    full, mask = scattered(xyz, N + 13, 0.0)
     found = np.asarray(neighbor_graph(full, mask, num_neighbors=K))
     real = np.flatnonzero(mask)
     for i in range(len(full)):

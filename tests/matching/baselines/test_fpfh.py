@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from network_clouds import scattered
 from scipy.spatial.transform import Rotation
 
 from vanejax.matching.baselines.fpfh import fpfh
@@ -117,10 +118,8 @@ def test_moving_and_permuting_the_cloud_changes_nothing():
 
 def test_padding_changes_nothing_and_has_no_histogram():
     xyz, normals = (values.astype(np.float32) for values in points())
-    mask = np.isin(np.arange(N + 40), np.random.default_rng(0).permutation(N + 40)[:N])
-    padded = [np.full((N + 40, 3), xyz[3]), np.full((N + 40, 3), 7.0, np.float32)]
-    for full, values in zip(padded, (xyz, normals), strict=True):
-        full[mask] = values
+    padded_xyz, mask = scattered(xyz, N + 40, xyz[3])
+    padded = padded_xyz, scattered(normals, N + 40, 7.0)[0]
     found = np.asarray(histograms(PointCloud(*padded, mask)))
     np.testing.assert_array_equal(found[~mask], 0)
     expected = histograms(cloud(xyz, normals))

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.special
+from network_clouds import scattered
 
 from vanejax.matching.baselines.transformer import LayerNorm, Transformer, attention
 
@@ -81,24 +82,6 @@ def slow_transformer(x, y, p) -> np.ndarray:
     return slow_norm(x, norms[3])
 
 
-def padded(x: np.ndarray, rows: int, junk: float) -> tuple[np.ndarray, np.ndarray]:
-    """Padding lies scattered among the real rows."""
-    place = np.sort(np.random.default_rng(2).permutation(rows)[: len(x)])
-    full = np.full((rows, x.shape[1]), junk)
-    full[place] = x
-    return full, np.isin(np.arange(rows), place)
-
-
-def test_attention_is_the_slow_twin():
-    rng = np.random.default_rng(3)
-    q, k, v = (rng.normal(size=(rows, HEADS, 5)) for rows in (N, M, M))
-    mask = np.arange(M) != 4
-    found = attention(q, k, v, mask)
-    for head in range(HEADS):
-        expected = slow_attention(q[:, head], k[mask, head], v[mask, head])
-        np.testing.assert_allclose(found[:, head], expected, atol=1e-13)  # f64 eps x 100
-
-
 def test_attention_to_large_scores_and_to_nothing_is_finite():
     q = np.full((N, HEADS, 5), 1e3)
     k = np.random.default_rng(4).normal(size=(M, HEADS, 5)) * 1e3
@@ -130,14 +113,14 @@ def test_it_is_the_slow_twin(params, clouds):
 
 @pytest.mark.parametrize("junk", [0.0, 1e3])
 def test_padding_of_either_cloud_changes_nothing(params, clouds, junk):
-    (x, x_mask), (y, y_mask) = (padded(cloud, len(cloud) + 5, junk) for cloud in clouds)
+    (x, x_mask), (y, y_mask) = (scattered(cloud, len(cloud) + 5, junk) for cloud in clouds)
     found = run(params, x, x_mask, y, y_mask)
     np.testing.assert_allclose(found[x_mask], slow_transformer(*clouds, params), atol=EXACT)
     assert np.isfinite(found).all()
 
 
 def test_no_gradient_reaches_padding(params, clouds):
-    (x, x_mask), (y, y_mask) = (padded(cloud, len(cloud) + 5, 0.3) for cloud in clouds)
+    (x, x_mask), (y, y_mask) = (scattered(cloud, len(cloud) + 5, 0.3) for cloud in clouds)
 
     def total(x, y):
         return jnp.sum(jnp.where(x_mask[:, None], run(params, x, x_mask, y, y_mask), 0) ** 3)
@@ -145,13 +128,3 @@ def test_no_gradient_reaches_padding(params, clouds):
     for found, mask in zip(jax.grad(total, (0, 1))(x, y), (x_mask, y_mask), strict=True):
         np.testing.assert_array_equal(found[~mask], 0)
         assert np.abs(found[mask]).max(axis=1).min() > 0
-
-
-def test_order_of_either_cloud(params, clouds):
-    """Its own order is kept; that of the cloud that it looks at does not matter."""
-    x, y = clouds
-    rng = np.random.default_rng(5)
-    rows, columns = rng.permutation(N), rng.permutation(M)
-    plain = run(params, x, np.ones(N, bool), y, np.ones(M, bool))
-    mixed = run(params, x[rows], np.ones(N, bool), y[columns], np.ones(M, bool))
-    np.testing.assert_allclose(mixed, plain[rows], atol=EXACT)

@@ -1,10 +1,8 @@
-"""DCP: Deep Closest Point v2 (Wang and Solomon, ICCV 2019).
+"""DCP: Deep Closest Point v2 (Wang and Solomon, ICCV 2019), in unit-sphere units of the part.
 
 Features of both clouds (`Dgcnn`), made to depend on each other by a transformer, point each source
 point softly at the target; the rigid motion is the least-squares fit to where they point, every
 point counting alike. There is no slack: each source point has a partner, whether it has one or not.
-
-Coordinates are in unit-sphere units: the part's centre is the origin, its radius is 1.
 """
 
 from __future__ import annotations
@@ -28,11 +26,10 @@ from vanejax.matching.contract import (
     pose_where,
 )
 from vanejax.matching.procrustes import weighted_procrustes
+from vanejax.matching.se3 import matmul
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.settings import Settings, positive, settings_class
-
-_MASKED = -1e9
 
 
 @flax.struct.dataclass
@@ -99,7 +96,7 @@ class Dcp(nn.Module, DcpSettings):
     def embed(self, cloud: PointCloud) -> Embedding:
         """All that a cloud [N] brings to a match: for the reference, once per part."""
         features = self.dgcnn(cloud.xyz, cloud.mask)
-        return Embedding(features=features, encoded=self.transformer.encode(features, cloud.mask))
+        return Embedding(features, self.transformer.encode(features, cloud.mask))
 
     def match(
         self,
@@ -116,27 +113,17 @@ class Dcp(nn.Module, DcpSettings):
         from_target = of_target.features + decode(of_target.encoded, of_source.encoded, source.mask)
         scores = jnp.matmul(from_source * self.width**-0.5, from_target.T)
         real = source.mask[:, None] & target.mask[None, :]
-        scores = jnp.where(real, scores, _MASKED)
-        partners = jnp.matmul(
-            jax.nn.softmax(scores, axis=1), target.xyz, precision=jax.lax.Precision.HIGHEST
-        )
+        scores = jnp.where(real, scores, -1e9)
+        partners = matmul(jax.nn.softmax(scores, axis=1), target.xyz)
         weights = source.mask.astype(partners.dtype)
-        return Match(
-            target_from_source=weighted_procrustes(source.xyz, partners, weights),
-            scores=scores,
-            partners=partners,
-        )
+        return Match(weighted_procrustes(source.xyz, partners, weights), scores, partners)
 
     def __call__(
         self, source: PointCloud, target: PointCloud, init: RigidTransform, iterations: int
     ) -> list[Match]:
         """All iterations from ``init``, the last one last, to look at; `last_match` is faster.
 
-        Args:
-          source: [N] points.
-          target: [M] points, the reference.
-          init: target_from_source to start from.
-          iterations: static; 1 as published.
+        Their number is static; 1 as published.
         """
         target_embedding = self.embed(target)
         matches: list[Match] = []
@@ -156,11 +143,7 @@ def last_match(
     iterations: int,
     target_embedding: Embedding | None = None,
 ) -> Match:
-    """The last of several iterations, at least 1, from ``init``; see `Dcp.match`.
-
-    Args:
-      target_embedding: of `Dcp.embed`, where several pairs share it.
-    """
+    """The last of several iterations, at least 1; pairs can share what `Dcp.embed` gives."""
     if target_embedding is None:
         target_embedding = model.apply(variables, target, method="embed")
 
@@ -185,13 +168,9 @@ def dcp(model: Dcp, variables: Mapping[str, Any], *, iterations: int = 1) -> Reg
         converged = both & jnp.all(jnp.isfinite(match.target_from_source.as_matrix()))
         pose = pose_where(converged, match.target_from_source, init)
         residual = jnp.where(converged, pose.apply(source.xyz) - match.partners, 0.0)
+        squared, weights = jnp.sum(residual**2, -1), source.mask & both
         return from_partners(
-            source,
-            pose,
-            jnp.sum(residual**2, -1),
-            source.mask & both,
-            converged=converged,
-            iterations=iterations,
+            source, pose, squared, weights, converged=converged, iterations=iterations
         )
 
     return register

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from vanejax.matching.baselines.fpfh import fpfh
+from vanejax.matching.se3 import matmul
 from vanejax.pointcloud import PointCloud
 
 _EXACT = jax.lax.Precision.HIGHEST
@@ -15,12 +16,9 @@ _FAR = 1e9  # feature distance of padding: above any real one, and finite
 
 @flax.struct.dataclass
 class Matches:
-    """Pairs of a source and a target point that look alike; a fixed number P of rows.
+    """Pairs of a source and a target point that look alike, in P rows.
 
-    Attributes:
-      source: [P] i32, index into the source.
-      target: [P] i32, index into the target.
-      mask: [P] bool, False where the row is no match.
+    Indices ``source`` and ``target`` [P] i32; ``mask`` [P] bool is False where a row is no match.
     """
 
     source: jax.Array
@@ -30,12 +28,7 @@ class Matches:
 
 @flax.struct.dataclass
 class Triangles:
-    """Three matches each; T rows.
-
-    Attributes:
-      rows: [T, 3] i32, into the matches.
-      agrees: [T] bool, whether one rigid motion explains all three.
-    """
+    """Three matches each: rows [T, 3] i32 of the matches, and whether one motion explains them."""
 
     rows: jax.Array
     agrees: jax.Array
@@ -52,7 +45,7 @@ def feature_distances(
     """
     a, b = jnp.sqrt(jnp.maximum(source, 0.0)), jnp.sqrt(jnp.maximum(target, 0.0))
     squared = jnp.sum(a**2, -1)[:, None] + jnp.sum(b**2, -1)[None, :]
-    squared = squared - 2 * jnp.matmul(a, b.T, precision=_EXACT)
+    squared = squared - 2 * matmul(a, b.T)
     return jnp.where(source_mask[:, None] & target_mask[None, :], squared, _FAR)
 
 
@@ -63,11 +56,11 @@ def fpfh_distances(source: PointCloud, target: PointCloud, *, radius: float) -> 
 
 
 def nearest_matches(distances: jax.Array, *, num_candidates: int, mutual: bool) -> Matches:
-    """Each source point with the K target points of the nearest features.
+    """Each source point with the K target points of the nearest features, at most all M.
 
     Args:
       distances: [N, M] f32 from `feature_distances`.
-      num_candidates: K; more than M counts as M.
+      num_candidates: K.
       mutual: keep only where the source point is among the target point's own K nearest as well.
 
     Returns:
@@ -104,7 +97,6 @@ def draw_triangles(
     those whose edges agree by chance.
 
     Args:
-      key: of the draw.
       matches: [P]; few or none are allowed.
       source, target: [N] and [M], what the matches point to.
       count: T.

@@ -10,7 +10,7 @@ from vanejax.matching.baselines.feature_matches import (
     fpfh_distances,
     nearest_matches,
 )
-from vanejax.matching.contract import Register, Registration, pose_where
+from vanejax.matching.contract import Register, Registration, from_partners, pose_where
 from vanejax.matching.procrustes import weighted_procrustes
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
@@ -44,12 +44,10 @@ def fgr(
       division: of mu, the squared width, every four iterations.
       iterations: of weights and motion.
       num_candidates: a match is mutual where each of the two points is among this many of the
-        other's most similar; the paper's is 1, which leaves too few on noisy partial scans.
+        other's most similar; the paper's 1 leaves too few on noisy partial scans.
       tuple_similarity: least ratio of corresponding edges of a tuple; 0.9 in the paper.
-      max_normal_angle: largest angle between corresponding normals of a tuple, in radians; pi asks
-        nothing of them, as in the paper.
-      num_tuples: tuples that count at most.
-      num_trials: tuples drawn.
+      max_normal_angle: of corresponding normals of a tuple, radians; the paper asks nothing, pi.
+      num_tuples, num_trials: tuples that count at most, and that are drawn.
 
     Returns:
       A `Register`. ``converged`` is False where no tuple passed or fewer than three matches lie
@@ -75,9 +73,7 @@ def fgr(
             max_normal_angle=max_normal_angle,
         )
         counted = tuples.agrees & (jnp.cumsum(tuples.agrees) <= num_tuples)
-        votes = (
-            jnp.zeros(matches.mask.shape).at[tuples.rows].add(counted[:, None].astype(jnp.float32))
-        )
+        votes = jnp.zeros(matches.mask.shape).at[tuples.rows].add(jnp.float32(counted[:, None]))
         p, q = source.xyz[matches.source], target.xyz[matches.target]
 
         def squared_residuals(pose: RigidTransform) -> jax.Array:
@@ -98,16 +94,17 @@ def fgr(
         converged = (jnp.sum(inside) >= 3) & jnp.all(jnp.isfinite(pose.as_matrix()))
         pose = pose_where(converged, pose, init)
         inside = (votes > 0) & (squared_residuals(pose) <= max_distance**2)
-        mean = jnp.sum(squared_residuals(pose), where=inside) / jnp.maximum(jnp.sum(inside), 1)
+        result = from_partners(
+            source,
+            pose,
+            squared_residuals(pose),
+            inside,
+            converged=converged,
+            iterations=iterations,
+        )
         # several matches of one point count once
         points = jnp.zeros(source.mask.shape, bool).at[matches.source].max(inside)
-        return Registration(
-            target_from_source=pose,
-            converged=converged,
-            iterations=jnp.asarray(iterations, jnp.int32),
-            rmse=jnp.sqrt(mean),
-            overlap=jnp.sum(points) / jnp.maximum(jnp.sum(source.mask), 1),
-        )
+        return result.replace(overlap=jnp.sum(points) / jnp.maximum(jnp.sum(source.mask), 1))
 
     return register
 

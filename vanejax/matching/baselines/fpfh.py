@@ -7,6 +7,7 @@ import math
 import jax
 import jax.numpy as jnp
 
+from vanejax.matching.se3 import matmul
 from vanejax.pointcloud import PointCloud, squared_distances
 
 _BINS = 11  # of each angle
@@ -60,7 +61,7 @@ def fpfh(cloud: PointCloud, *, radius: float) -> jax.Array:
         # a weight of nearly coincident points must not outgrow f32
         floor = jnp.maximum(squared, 1e-12 * radius**2)
         weights = jnp.where(near & (squared > 0), radius**2 / floor, 0.0)
-        return jnp.matmul(weights, own, precision=jax.lax.Precision.HIGHEST)
+        return matmul(weights, own)
 
     own = jax.lax.map(simple, blocks).reshape(-1, 3 * _BINS)[:count]
     around = jax.lax.map(weighted, blocks).reshape(-1, 3, _BINS)[:count]

@@ -1,8 +1,7 @@
 """ICP: iterative closest point, to points or to planes, robust and trimmed.
 
-Each iteration pairs every moved source point with the nearest target point and solves for the
-motion. It finds the nearest minimum: start it within a few degrees and a few hundredths of the
-cloud's size. Besl and McKay (1992), Chen and Medioni (1992).
+It finds the nearest minimum: start it within a few degrees and a few hundredths of the cloud's
+size. Besl and McKay (1992), Chen and Medioni (1992).
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 from vanejax.errors import InputError
 from vanejax.matching.contract import Register, Registration, from_partners, pose_where
 from vanejax.matching.procrustes import weighted_procrustes
-from vanejax.matching.se3 import exp_se3, rotation_angle
+from vanejax.matching.se3 import exp_se3, matmul, rotation_angle
 from vanejax.pointcloud import PointCloud, nearest_neighbors
 from vanejax.rigid import RigidTransform
 
@@ -26,12 +25,8 @@ KERNELS = ("none", "huber", "tukey")
 class Pairs:
     """Moved source points and their nearest target points.
 
-    Attributes:
-      moved: [N, 3] f32, the source points in the target's frame.
-      partners: [N, 3] f32, of no meaning where not kept.
-      normals: [N, 3] f32, of the partners.
-      squared: [N] f32, squared distance between the two; infinite without a target.
-      kept: [N] bool, real, near enough, and not trimmed.
+    Moved points, partners and the partners' normals [N, 3] f32 in the target's frame; the squared
+    distance between the two [N]; kept [N] bool: real, near enough, and not trimmed.
     """
 
     moved: jax.Array
@@ -66,9 +61,8 @@ def icp(
 
     Converged means that the last update was below both tolerances and that enough pairs hold the
     pose in all six directions: a plane under ``point_to_plane`` or a line under ``point_to_point``
-    does not. Overlap is the share of real source points whose pair is kept, and rmse the root mean
-    square distance of these pairs, under both metrics. Without enough pairs the pose stays as it
-    is.
+    does not. Overlap is the share of source points whose pair is kept, and rmse the distance of
+    these pairs, under both metrics. Without enough pairs the pose stays as it is.
 
     Args:
       metric: ``point_to_point`` (Besl and McKay, 1992), or ``point_to_plane``: along the target's
@@ -199,12 +193,10 @@ def _mean(points: jax.Array, weights: jax.Array) -> jax.Array:
 def _plane_system(
     pairs: Pairs, weights: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Normal equations of the distances along the normals, about the pairs' centre.
+    """Normal equations [6, 6] and [6] of the distances along the normals, mean per pair.
 
-    Returns:
-      matrix [6, 6] and right side [6] for (rotation x size, translation), mean per pair; the centre
-      [3] and the size [] of the pairs. Measured in sizes from the centre, rotation and translation
-      count alike and hardly mix: without that f32 would not hold the system.
+    They are for (rotation x size, translation) about the pairs' centre [3], in their size []:
+    rotation and translation then count alike and hardly mix, or f32 would not hold the system.
     """
     share = weights / jnp.maximum(jnp.sum(weights), 1e-6)
     centre = _mean(pairs.moved, weights)
@@ -214,9 +206,7 @@ def _plane_system(
     rows = jnp.concatenate([jnp.cross(arm / size, pairs.normals), pairs.normals], -1)
     residuals = _dot(pairs.normals, pairs.partners - pairs.moved)
     left = (share[:, None] * rows).T
-    exact = jax.lax.Precision.HIGHEST
-    matrix = jnp.matmul(left, rows, precision=exact)
-    return matrix, jnp.matmul(left, residuals, precision=exact), centre, size
+    return matmul(left, rows), matmul(left, residuals), centre, size
 
 
 def _plane_update(pairs: Pairs, weights: jax.Array) -> RigidTransform:
@@ -245,5 +235,5 @@ def _held_to_points(pairs: Pairs, weights: jax.Array) -> jax.Array:
     """Whether the partners spread in two directions, which fixes a rotation: [] bool."""
     arm = pairs.partners - _mean(pairs.partners, weights)[None]
     left = (weights[:, None] * arm).T
-    spread = jnp.linalg.eigvalsh(jnp.matmul(left, arm, precision=jax.lax.Precision.HIGHEST))
+    spread = jnp.linalg.eigvalsh(matmul(left, arm))
     return spread[1] > 1e-6 * spread[2]  # f32 eps x 10

@@ -2,9 +2,7 @@
 
 The iterative form: one network looks at the source where it lies now and at the template, and
 answers with the motion that is left; the next iteration starts from there with the same weights.
-
-Nothing is centred, as published: the network knows coordinates in the frame and the unit that it
-was trained in, unit-sphere units of the part.
+Nothing is centred, as published: the network knows the unit-sphere frame it was trained in.
 """
 
 from __future__ import annotations
@@ -21,10 +19,10 @@ from vanejax.matching.baselines.pointnet import (
     DenseLayers,
     cloud_feature,
     dense_relu,
-    registration_from_pose,
+    register_by_pose,
 )
-from vanejax.matching.contract import Register, Registration
-from vanejax.matching.se3 import hat
+from vanejax.matching.contract import Register
+from vanejax.matching.se3 import hat, matmul
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.settings import Settings, bounded, settings_class
@@ -32,11 +30,7 @@ from vanejax.settings import Settings, bounded, settings_class
 
 @settings_class
 class PcrNetSettings(Settings):
-    """What a PCRNet is made of; the default is as published.
-
-    Attributes:
-      head: channels of the hidden layers that read the pose.
-    """
+    """What a PCRNet is made of: ``head``, the hidden layers' channels, by default as published."""
 
     head: tuple[int, ...] = bounded(
         (1024, 1024, 512, 512, 256),
@@ -74,12 +68,8 @@ class PcrNet(nn.Module, PcrNetSettings):
     ) -> RigidTransform:
         """The total motion after each iteration from ``init``, along a leading axis.
 
-        Args:
-          source: [N] points.
-          target: [M] points, the template.
-          init: target_from_source to start from.
-          iterations: static, at least 1; 8 as published.
-          template: [1024] from `template`, to share it between pairs.
+        The number of iterations is static, at least 1; 8 as published. Pairs can share a
+        `template`.
         """
         if template is None:
             template = self.template(target)
@@ -102,8 +92,7 @@ def _rotation(quaternion: jax.Array) -> jax.Array:
     squared = jnp.sum(quaternion**2)
     unit = quaternion * jax.lax.rsqrt(jnp.maximum(squared, 1e-20))
     k = hat(unit[1:])
-    square = jnp.matmul(k, k, precision=jax.lax.Precision.HIGHEST)
-    return jnp.eye(3, dtype=k.dtype) + 2 * unit[0] * k + 2 * square
+    return jnp.eye(3, dtype=k.dtype) + 2 * unit[0] * k + 2 * matmul(k, k)
 
 
 def pcrnet(
@@ -121,23 +110,13 @@ def pcrnet(
     Args:
       model, variables: the network and its weights.
       iterations: at least 1; 8 as published.
-      partner_distance: see `pointnet.registration_from_pose`; unit-sphere units (on the vane, 1 is
-        73 mm).
+      partner_distance: see `pointnet.register_by_pose`; on the vane, 1 is 73 mm.
     """
 
-    def register(
-        source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
-    ) -> Registration:
-        del key  # nothing here is random
+    def solve(
+        source: PointCloud, target: PointCloud, init: RigidTransform
+    ) -> tuple[RigidTransform, jax.Array]:
         poses = model.apply(variables, source, target, init, iterations)
-        return registration_from_pose(
-            source,
-            target,
-            jax.tree.map(lambda leaf: leaf[-1], poses),
-            init,
-            settled=jnp.asarray(True),
-            iterations=iterations,
-            partner_distance=partner_distance,
-        )
+        return jax.tree.map(lambda leaf: leaf[-1], poses), jnp.asarray(True)
 
-    return register
+    return register_by_pose(solve, iterations=iterations, partner_distance=partner_distance)

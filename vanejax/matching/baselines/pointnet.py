@@ -1,21 +1,20 @@
 """PointNet: one feature for a whole cloud, and what is made of it (Qi et al., CVPR 2017).
 
 The points pass through the same dense layers, and the maximum over the real ones is the cloud's
-feature. No layer is normalised: a batch's statistics would mix pairs and see padding, are empty for
-one pair alone, and amount to other kernels once trained. He's initialisation keeps the scale.
-
-The layers are handed out as arrays, so that a loop over iterations can be one `jax.lax.scan`.
+feature. No layer is normalised: a batch's statistics would mix pairs and see padding. The layers
+are handed out as arrays, so that a loop over iterations can be one `jax.lax.scan`.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from vanejax.matching.contract import Registration, from_partners, pose_where
+from vanejax.matching.contract import Register, Registration, from_partners, pose_where
 from vanejax.matching.fused_layers import cloud_max, product
 from vanejax.pointcloud import PointCloud, squared_distances
 from vanejax.rigid import RigidTransform
@@ -28,8 +27,7 @@ WIDTHS = (3, 64, 64, 64, 128, 1024)  # of the encoder of PointNetLK and PCRNet
 class DenseLayers(nn.Module):
     """The parameters of dense layers with ReLU, under He's initialisation (He et al., 2015).
 
-    Attributes:
-      widths: channels of the input, then of every layer.
+    ``widths`` are the channels of the input, then of every layer.
     """
 
     widths: tuple[int, ...] = WIDTHS
@@ -72,39 +70,35 @@ def cloud_feature(layers: Layers, xyz: jax.Array, mask: jax.Array) -> jax.Array:
         return nn.relu(cloud_max(dense_relu(layers[:-1], xyz), kernel, mask) + bias)
 
 
-def registration_from_pose(
-    source: PointCloud,
-    target: PointCloud,
-    target_from_source: RigidTransform,
-    init: RigidTransform,
+def register_by_pose(
+    solve: Callable[[PointCloud, PointCloud, RigidTransform], tuple[RigidTransform, jax.Array]],
     *,
-    settled: jax.Array,
     iterations: int,
     partner_distance: float,
-) -> Registration:
-    """The common result type where a method knows no correspondences.
+) -> Register:
+    """A method that knows no correspondences: a point's partner is the nearest target point.
 
     Args:
-      source: [N] points.
-      target: [M] points.
-      target_from_source: the answer; where it is not finite or a cloud is empty, ``init`` is.
-      init: what it started from.
-      settled: [] bool, whether the method itself holds its answer for one.
+      solve: from source, target and init to the answer and whether it has settled on it. ``init``
+        is the answer instead where it is not finite or a cloud is empty.
       iterations: done.
-      partner_distance: a source point's partner is the nearest target point, up to here, in the
-        clouds' unit.
+      partner_distance: partners lie within it, in the clouds' unit.
     """
-    finite = jnp.all(jnp.isfinite(target_from_source.as_matrix()))
-    known = finite & jnp.any(source.mask) & jnp.any(target.mask)
-    pose = pose_where(known, target_from_source, init)
-    squared = squared_distances(pose.apply(source.xyz), target.xyz)
-    nearest = jnp.min(squared, axis=1, where=target.mask[None, :], initial=jnp.inf)
-    partnered = source.mask & (nearest <= partner_distance**2)
-    return from_partners(
-        source,
-        pose,
-        nearest,
-        partnered,
-        converged=known & settled & jnp.any(partnered),
-        iterations=iterations,
-    )
+
+    def register(
+        source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
+    ) -> Registration:
+        del key  # nothing here is random
+        found, settled = solve(source, target, init)
+        known = jnp.all(jnp.isfinite(found.as_matrix())) & jnp.any(source.mask)
+        known &= jnp.any(target.mask)
+        pose = pose_where(known, found, init)
+        squared = squared_distances(pose.apply(source.xyz), target.xyz)
+        nearest = jnp.min(squared, axis=1, where=target.mask[None, :], initial=jnp.inf)
+        partnered = source.mask & (nearest <= partner_distance**2)
+        converged = known & settled & jnp.any(partnered)
+        return from_partners(
+            source, pose, nearest, partnered, converged=converged, iterations=iterations
+        )
+
+    return register

@@ -1,10 +1,8 @@
 """PointNetLK: Lucas and Kanade's algorithm on PointNet features (Aoki et al., CVPR 2019).
 
 The inverse compositional form: how the template's feature changes with its pose is found once, and
-every iteration turns the difference of the two clouds' features into a step of the source.
-
-Coordinates are in one unit, the length ``delta`` too: unit-sphere units, where the part's radius
-is 1.
+every iteration turns the difference of the two clouds' features into a step of the source. All
+lengths are in unit-sphere units of the part.
 """
 
 from __future__ import annotations
@@ -20,27 +18,22 @@ import jax.numpy as jnp
 from vanejax.matching.baselines.pointnet import (
     WIDTHS,
     DenseLayers,
-    Layers,
     cloud_feature,
-    registration_from_pose,
+    register_by_pose,
 )
-from vanejax.matching.contract import Register, Registration
-from vanejax.matching.se3 import exp_se3
+from vanejax.matching.contract import Register
+from vanejax.matching.se3 import exp_se3, matmul
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.settings import Settings, not_negative, one_of, positive, settings_class
-
-_EXACT = jax.lax.Precision.HIGHEST
 
 
 @flax.struct.dataclass
 class Template:
     """What does not change while sources are aligned to one target.
 
-    Attributes:
-      mean: [3] f32, of the target's points; the origin that it was described about.
-      feature: [C] f32.
-      twist_from_feature: [6, C] f32, the Jacobian's pseudo-inverse.
+    The mean [3] of its points, about which it is described, its feature [C], and the Jacobian's
+    pseudo-inverse [6, C], f32.
     """
 
     mean: jax.Array
@@ -53,7 +46,7 @@ class LucasKanadeSteps:
     """All iterations of PointNetLK, along a leading axis I.
 
     Attributes:
-      target_from_source: [I] the total motion after each iteration.
+      target_from_source: [I] the total motion after each.
       twist: [I, 6] f32, the step taken: rotation in radians, translation.
       residual: [I, C] f32, feature of the source before the step minus the template's.
     """
@@ -107,15 +100,11 @@ class PointNetLK(nn.Module, PointNetLKSettings):
 
         # one after the other: a pass fits the caches, six side by side do not
         columns = jax.lax.map(column, self.delta * jnp.eye(6, dtype=feature.dtype))
-        normal = jnp.matmul(columns, columns.T, precision=_EXACT)
+        normal = matmul(columns, columns.T)
         # of no weight where the Jacobian has full rank; without it, no answer where it has not
         ridge = self.damping * jnp.trace(normal) / 6 + 1e-12
         factor = jax.scipy.linalg.cho_factor(normal + ridge * jnp.eye(6, dtype=normal.dtype))
-        return Template(
-            mean=mean,
-            feature=feature,
-            twist_from_feature=jax.scipy.linalg.cho_solve(factor, columns),
-        )
+        return Template(mean, feature, jax.scipy.linalg.cho_solve(factor, columns))
 
     def __call__(
         self,
@@ -125,21 +114,13 @@ class PointNetLK(nn.Module, PointNetLKSettings):
         iterations: int,
         template: Template | None = None,
     ) -> LucasKanadeSteps:
-        """All iterations from ``init``.
-
-        Args:
-          source: [N] points.
-          target: [M] points, the template.
-          init: target_from_source to start from.
-          iterations: static, at least 1.
-          template: from `template`, to share it between pairs.
-        """
+        """All iterations (static, at least 1) from ``init``; pairs can share a `template`."""
         if template is None:
             template = self.template(target)
         layers = self.encoder()
         moved = init.apply(source.xyz)
         mean = _mean(moved, source.mask) if self.origin == "means" else template.mean
-        centered = source.replace(xyz=moved - mean[None, :])
+        centered = moved - mean[None, :]
         eye = jnp.eye(3, dtype=moved.dtype)
         template_from_target = RigidTransform(rotation=eye, translation=-template.mean)
         source_from_init = RigidTransform(rotation=eye, translation=-mean) @ init
@@ -147,22 +128,15 @@ class PointNetLK(nn.Module, PointNetLKSettings):
         def iteration(
             template_from_source: RigidTransform, _: None
         ) -> tuple[RigidTransform, LucasKanadeSteps]:
-            twist, residual = _step(layers, template, centered, template_from_source)
+            moved = template_from_source.apply(centered)
+            residual = cloud_feature(layers, moved, source.mask) - template.feature
+            twist = -matmul(template.twist_from_feature, residual)
             pose = exp_se3(twist) @ template_from_source
             total = template_from_target.inverse() @ pose @ source_from_init
             return jax.lax.stop_gradient(pose), LucasKanadeSteps(total, twist, residual)
 
         start = RigidTransform(rotation=eye, translation=jnp.zeros_like(mean))
         return jax.lax.scan(iteration, start, length=iterations)[1]
-
-
-def _step(
-    layers: Layers, template: Template, source: PointCloud, template_from_source: RigidTransform
-) -> tuple[jax.Array, jax.Array]:
-    """The twist [6] that brings the moved source's feature to the template's, and the residual."""
-    moved = template_from_source.apply(source.xyz)
-    residual = cloud_feature(layers, moved, source.mask) - template.feature
-    return -jnp.matmul(template.twist_from_feature, residual, precision=_EXACT), residual
 
 
 def _mean(xyz: jax.Array, mask: jax.Array) -> jax.Array:
@@ -178,30 +152,21 @@ def pointnetlk(
     tolerance: float = 1e-2,
     partner_distance: float = 0.1,
 ) -> Register:
-    """A trained PointNetLK as a `Register`.
+    """A trained PointNetLK as a `Register`: source and target in unit-sphere units.
 
     Args:
-      model, variables: the network and its weights; they fix the clouds' unit, as a rule
-        unit-sphere units (on the vane, 1 is 73 mm).
+      model, variables: the network and its weights.
       iterations: at least 1; 10 as published.
       tolerance: it has converged where the last step's twist is shorter (radians and the clouds'
         unit).
-      partner_distance: see `pointnet.registration_from_pose`.
+      partner_distance: see `pointnet.register_by_pose`; on the vane, 1 is 73 mm.
     """
 
-    def register(
-        source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
-    ) -> Registration:
-        del key  # nothing here is random
+    def solve(
+        source: PointCloud, target: PointCloud, init: RigidTransform
+    ) -> tuple[RigidTransform, jax.Array]:
         steps = model.apply(variables, source, target, init, iterations)
-        return registration_from_pose(
-            source,
-            target,
-            jax.tree.map(lambda leaf: leaf[-1], steps.target_from_source),
-            init,
-            settled=jnp.linalg.norm(steps.twist[-1]) < tolerance,
-            iterations=iterations,
-            partner_distance=partner_distance,
-        )
+        last = jax.tree.map(lambda leaf: leaf[-1], steps)
+        return last.target_from_source, jnp.linalg.norm(last.twist) < tolerance
 
-    return register
+    return register_by_pose(solve, iterations=iterations, partner_distance=partner_distance)

@@ -17,7 +17,7 @@ from vanejax.matching.baselines.feature_matches import (
 )
 from vanejax.matching.contract import Register, Registration, from_partners, pose_where
 from vanejax.matching.procrustes import weighted_procrustes
-from vanejax.matching.se3 import exp_so3, hat
+from vanejax.matching.se3 import exp_so3, hat, matmul
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 
@@ -51,16 +51,13 @@ def sac_ia(
     in which a part resembles itself, as when turned by 180 degrees, betrays itself only there.
 
     Args:
-      feature_radius: of an FPFH neighbourhood, in the clouds' unit (unit-sphere units of the vane:
-        0.3 to 0.5).
-      max_distance: farthest partner of a point, in the clouds' unit; about the spacing of the
-        target's points.
+      feature_radius: of an FPFH neighbourhood, in the clouds' unit (0.3 to 0.5 for the vane).
+      max_distance: farthest partner, in the clouds' unit; about the spacing of the target's points.
       num_hypotheses: triples drawn.
       num_candidates: among this many of the most similar target points one is drawn.
       edge_similarity: least ratio of corresponding edges of the two triangles.
       max_normal_angle: largest angle between corresponding normals, in radians.
-      num_scored: of the congruent triples, at most this many are scored.
-      num_refined: of the scored ones, this many are refined.
+      num_scored, num_refined: of the congruent triples, and of the scored ones, at most.
       refinements: point-to-plane steps; 0 gives the pose of the best triple.
 
     Returns:
@@ -108,13 +105,10 @@ def sac_ia(
         converged = (score[winner] > 0) & (jnp.sum(closeness[winner] > 0) >= 3)
         pose = pose_where(converged, jax.tree.map(lambda leaf: leaf[winner], poses), init)
         moved = source.transform(pose)
+        squared = jnp.sum((moved.xyz - target.xyz[_nearest(moved, surface)]) ** 2, -1)
+        partnered = _closeness(pose, source, surface) > 0
         return from_partners(
-            source,
-            pose,
-            jnp.sum((moved.xyz - target.xyz[_nearest(moved, surface)]) ** 2, -1),
-            _closeness(pose, source, surface) > 0,
-            converged=converged,
-            iterations=refinements,
+            source, pose, squared, partnered, converged=converged, iterations=refinements
         )
 
     return register
@@ -122,16 +116,12 @@ def sac_ia(
 
 @flax.struct.dataclass
 class _Surface:
-    """The target, made ready for many searches of the nearest point.
+    """The target [M], made ready for many searches of the nearest point.
 
     Nearest in position and normal at once, ``|p - q|^2 + d^2 |n_p - n_q|^2`` with d the largest
-    distance of a partner, so that the two sides of a thin wall stay apart.
-
-    Attributes:
-      cloud: [M] the target.
-      center: [3] f32, its mean; ``|b|^2 - 2 a.b`` about it loses nothing.
-      rows: [tiles x _TILE, 7] f32, such that ``rows @ (a, 1)`` is the squared distance less |a|^2.
-      max_distance: [] f32, d.
+    distance of a partner, so that the two sides of a thin wall stay apart. With points a about its
+    mean, where ``|b|^2 - 2 a.b`` loses nothing, ``rows @ (a, 1)`` is the squared distance less
+    |a|^2: rows [tiles x _TILE, 7].
     """
 
     cloud: PointCloud
@@ -149,7 +139,7 @@ def _surface(target: PointCloud, max_distance: float) -> _Surface:
     size = jnp.where(real, jnp.sum(b**2, -1, keepdims=True), _FAR * reach**2)
     rows = jnp.concatenate([-2 * b, size], -1)
     spare = ((0, -rows.shape[0] % _TILE), (0, 0))
-    rows = jnp.pad(rows, spare, constant_values=0.0).at[target.mask.size :, 6].set(_FAR * reach**2)
+    rows = jnp.pad(rows, spare).at[target.mask.size :, 6].set(_FAR * reach**2)
     return _Surface(cloud=target, center=center, rows=rows, max_distance=reach)
 
 
@@ -160,7 +150,7 @@ def _squared(moved: PointCloud, surface: _Surface) -> tuple[jax.Array, jax.Array
     """
     a = [moved.xyz - surface.center[None], surface.max_distance * moved.normals]
     a = jnp.concatenate([*a, jnp.ones((moved.mask.size, 1))], -1)
-    return jnp.matmul(surface.rows, a.T, precision=_EXACT), jnp.sum(a[:, :6] ** 2, -1)
+    return matmul(surface.rows, a.T), jnp.sum(a[:, :6] ** 2, -1)
 
 
 def _closeness(pose: RigidTransform, source: PointCloud, surface: _Surface) -> jax.Array:
@@ -214,7 +204,7 @@ def _refined(pose: RigidTransform, source: PointCloud, surface: _Surface) -> Rig
     damping = jnp.repeat(jnp.stack([surface.max_distance**2, jnp.ones(())]), 3)
     delta = -jnp.linalg.solve(hessian + _DAMPING * jnp.diag(damping), gradient)
     rotation = exp_so3(delta[:3])
-    shift = center + delta[3:] - jnp.matmul(rotation, center, precision=_EXACT)
+    shift = center + delta[3:] - matmul(rotation, center)
     return RigidTransform(rotation=rotation, translation=shift) @ pose
 
 

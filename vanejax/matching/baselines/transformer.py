@@ -12,6 +12,8 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from vanejax.matching.se3 import safe_sqrt
+
 _EPSILON = 1e-6  # added to the standard deviation, as published
 _MASKED = -1e9  # its exponential is exactly zero beside any real score
 
@@ -34,10 +36,8 @@ class Encoded:
 def attention(queries: jax.Array, keys: jax.Array, values: jax.Array, mask: jax.Array) -> jax.Array:
     """``softmax(q k^T / sqrt(D)) v`` for each head (Vaswani et al., 2017, eq. 1): [N, H, D] f32.
 
-    Args:
-      queries: [N, H, D] f32.
-      keys, values: [M, H, D] f32.
-      mask: [M] bool; padding gets no weight. With nothing real the answer is a finite mean.
+    From queries [N, H, D] to keys and values [M, H, D]. Padding, where mask [M] is False, gets no
+    weight; with nothing real the answer is a finite mean.
     """
     scores = jnp.einsum("nhd,mhd->hnm", queries * queries.shape[-1] ** -0.5, keys)
     scores = jnp.where(mask[None, None, :], scores, _MASKED)
@@ -58,9 +58,7 @@ class LayerNorm(nn.Module):
         gain = self.param("scale", nn.initializers.ones, (channels,))
         bias = self.param("bias", nn.initializers.zeros, (channels,))
         offset = x - jnp.mean(x, -1, keepdims=True)
-        variance = jnp.sum(offset**2, -1, keepdims=True) / (channels - 1)
-        flat = variance == 0
-        std = jnp.where(flat, 0.0, jnp.sqrt(jnp.where(flat, 1.0, variance)))
+        std = safe_sqrt(jnp.sum(offset**2, -1, keepdims=True) / (channels - 1))
         return offset * (gain[None, :] / (std + _EPSILON)) + bias[None, :]
 
 
@@ -72,10 +70,7 @@ class MultiHeadAttention(nn.Module):
 
     def setup(self) -> None:
         """Names the four projections."""
-        self.query = nn.Dense(self.width)
-        self.key = nn.Dense(self.width)
-        self.value = nn.Dense(self.width)
-        self.out = nn.Dense(self.width)
+        self.query, self.key, self.value, self.out = (nn.Dense(self.width) for _ in range(4))
 
     def queries(self, x: jax.Array) -> jax.Array:
         """[N, H, D] of points x [N, width]."""
@@ -126,10 +121,7 @@ class Transformer(nn.Module):
         self.decoder_norms = [LayerNorm() for _ in range(4)]
 
     def encode(self, x: jax.Array, mask: jax.Array) -> Encoded:
-        """The encoder, and the decoder up to where it looks at the other cloud.
-
-        From features x [N, width] and mask [N] bool.
-        """
+        """The encoder, and the decoder up to where it looks at the other cloud, of x [N, width]."""
         first, second, third = self.encoder_norms
         memory = x + self.encoder_attention.within(first(x), mask)
         memory = third(memory + self.encoder_feed_forward(second(memory)))
@@ -140,9 +132,8 @@ class Transformer(nn.Module):
 
     def decode(self, encoded: Encoded, other: Encoded, other_mask: jax.Array) -> jax.Array:
         """The decoder's output [N, width] for a cloud that looks at another, mask [M] bool."""
-        x = encoded.state + self.cross_attention(
-            encoded.queries, other.keys, other.values, other_mask
-        )
+        read = self.cross_attention(encoded.queries, other.keys, other.values, other_mask)
+        x = encoded.state + read
         return self.decoder_norms[3](x + self.decoder_feed_forward(self.decoder_norms[2](x)))
 
     def __call__(
