@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import flax.struct
 import jax
@@ -32,9 +32,13 @@ class Registration:
     overlap: jax.Array
 
 
-# One pair in, one pose out: (source, target, init, key) to target_from_source, found from ``init``;
-# pure, jit-able and vmap-able.
-Register = Callable[[PointCloud, PointCloud, RigidTransform, jax.Array], Registration]
+class Register(Protocol):
+    """One pair in, one pose out: pure, jit-able and vmap-able."""
+
+    def __call__(
+        self, source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
+    ) -> Registration:
+        """Finds target_from_source, starting at ``init``."""
 
 
 def chain(coarse: Register, fine: Register) -> Register:

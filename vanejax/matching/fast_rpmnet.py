@@ -22,17 +22,36 @@ from vanejax.matching.fused_layers import (
     NormedLayer,
     norm_relu,
 )
-from vanejax.matching.rpmnet import Match, RpmNet, both_clouds, match_features, neighborhoods
+from vanejax.matching.rpmnet import (
+    AnnealingNet,
+    FeatureNet,
+    Match,
+    RpmNet,
+    both_clouds,
+    match_features,
+    neighborhoods,
+)
 from vanejax.matching.se3 import matmul
 from vanejax.matching.sinkhorn import log_sinkhorn
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 
 
-def features(model: RpmNet, variables: Mapping[str, Any], cloud: PointCloud) -> jax.Array:
-    """Features [M, feature_width] of a cloud: for the reference, once per part."""
-    unturned = jnp.eye(3, dtype=cloud.xyz.dtype)
-    return _features(model, variables, cloud, neighborhoods(model, cloud), unturned)
+def features(
+    model: RpmNet,
+    variables: Mapping[str, Any],
+    cloud: PointCloud,
+    near: jax.Array | None = None,
+    rotation: jax.Array | None = None,
+) -> jax.Array:
+    """Features [M, feature_width] of a cloud: for the reference, once per part.
+
+    Where the cloud was turned after its neighbourhoods ``near`` were found, by ``rotation``.
+    """
+    near = neighborhoods(model, cloud) if near is None else near
+    rotation = jnp.eye(3, dtype=cloud.xyz.dtype) if rotation is None else rotation
+    net, params = _FeatureNet(model.feature_width), variables["params"]["feature_net"]
+    return net.apply({"params": params}, cloud.xyz, near, rotation, cloud.mask)
 
 
 def match(
@@ -46,23 +65,16 @@ def match(
 ) -> Match:
     """One iteration from the pose ``target_from_source``.
 
-    Args:
-      model, variables: the network and its weights.
-      source: [N] points.
-      near: [N, K, 7] f32 of the source, from `neighborhoods`.
-      target: [M] points, the reference.
-      target_features: [M, feature_width] f32, from `features`.
-      target_from_source: the pose to start from.
+    From a source [N] with its `neighborhoods` ``near`` [N, K, 7] and a target [M] with its
+    `features` [M, feature_width], f32.
     """
     moved = source.replace(xyz=target_from_source.apply(source.xyz))
-    source_features = _features(model, variables, moved, near, target_from_source.rotation)
+    source_features = features(model, variables, moved, near, target_from_source.rotation)
     beta, alpha = _AnnealingNet().apply(
         {"params": variables["params"]["annealing_net"]}, *both_clouds(moved, target)
     )
-    features = source_features, target_features
-    return match_features(
-        source, target, *features, alpha, beta, model.sinkhorn_iterations, log_sinkhorn
-    )
+    pair = source, target, source_features, target_features
+    return match_features(*pair, alpha, beta, model.sinkhorn_iterations, log_sinkhorn)
 
 
 def last_match(
@@ -109,18 +121,6 @@ def rpmnet(model: RpmNet, variables: Mapping[str, Any], *, iterations: int = 5) 
     return register
 
 
-def _features(
-    model: RpmNet,
-    variables: Mapping[str, Any],
-    cloud: PointCloud,
-    near: jax.Array,
-    rotation: jax.Array,
-) -> jax.Array:
-    """Features [N, width] of a cloud that was moved after its neighbourhoods were found."""
-    net, params = _FeatureNet(model.feature_width), variables["params"]["feature_net"]
-    return net.apply({"params": params}, cloud.xyz, near, rotation, cloud.mask)
-
-
 class _NeighborhoodLayer(NormedLayer):
     """`DenseNormRelu` of ``[xyz, turned offset, ppf]``; what is turned is the kernel."""
 
@@ -135,10 +135,10 @@ class _NeighborhoodLayer(NormedLayer):
         return norm_relu(jnp.concatenate([center, near], -1), turned, bias, norm, mask)
 
 
-class _FeatureNet(nn.Module):
-    """`vanejax.matching.rpmnet.FeatureNet` of neighbourhoods that turn with the cloud."""
+class _FeatureNet(FeatureNet):
+    """`FeatureNet` of neighbourhoods that turn with the cloud."""
 
-    width: int
+    layer: Any = DenseNormRelu
 
     @nn.compact
     def __call__(
@@ -148,25 +148,13 @@ class _FeatureNet(nn.Module):
         x = _NeighborhoodLayer(self.width, name="prepool_0")(xyz, near, rotation, mask)
         x = DenseNormRelu(self.width, name="prepool_1")(x, mask)
         x = DenseNormReluMax(2 * self.width, name="prepool_2")(x, mask)
-        x = DenseNormRelu(2 * self.width, name="postpool_0")(x, mask)
-        x = DenseNormRelu(self.width, name="postpool_1")(x, mask)
-        x = nn.Dense(self.width, name="postpool_2")(x)
-        # Padding may be exactly zero here; its length is sanitised, never divided by.
-        squared = jnp.sum(x**2, -1, keepdims=True)
-        return x * jax.lax.rsqrt(jnp.maximum(squared, 1e-20))
+        return self.postpool(x, mask)
 
 
-class _AnnealingNet(nn.Module):
-    """`vanejax.matching.rpmnet.AnnealingNet`, the maximum fused with the layer before it."""
+class _AnnealingNet(AnnealingNet):
+    """`AnnealingNet`, the maximum fused with the layer before it."""
 
-    @nn.compact
-    def __call__(self, x: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """From `both_clouds` to (beta [], alpha [])."""
-        for index, features in enumerate((64, 64, 64, 128)):
-            x = DenseNormRelu(features, name=f"prepool_{index}")(x, mask)
-        x = DenseNormReluCloudMax(1024, num_groups=16, name="prepool_4")(x, mask)[None, :]
-        one = jnp.ones((1,), bool)
-        x = DenseNormRelu(512, num_groups=16, name="postpool_0")(x, one)
-        x = DenseNormRelu(256, num_groups=16, name="postpool_1")(x, one)
-        beta, alpha = nn.softplus(nn.Dense(2, name="postpool_2")(x))[0]
-        return beta, alpha
+    layer: Any = DenseNormRelu
+
+    def maximum(self, x: jax.Array, mask: jax.Array) -> jax.Array:
+        return DenseNormReluCloudMax(1024, num_groups=16, name="prepool_4")(x, mask)[None, :]

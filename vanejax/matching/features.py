@@ -31,12 +31,11 @@ def point_pair_features(
 
     Args:
       offset: [N, K, 3] f32, neighbour minus point.
-      normal: [N, 3] f32, of the point.
-      neighbor_normal: [N, K, 3] f32.
+      normal, neighbor_normal: [N, 3] and [N, K, 3] f32.
 
     Returns:
       [N, K, 4] f32: angle(normal, offset), angle(neighbour normal, offset), angle between the
-      normals (radians), and the length of the offset. (0, 0, 0, 0) for the point itself.
+      normals (radians), and the length of the offset; zeros for the point itself.
 
     Source: Drost et al. (2010), in the order of RPM-Net.
     """

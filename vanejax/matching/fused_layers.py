@@ -46,10 +46,9 @@ class GroupNorm(nn.Module):
     def __call__(
         self, mean: jax.Array, variance: jax.Array, offset: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Scale and shift [C] of y, so that ``y * scale + shift`` is the normalised ``y + offset``.
+        """Scale and shift [C] that normalise ``y + offset``, from mean and variance [C] of y.
 
-        ``mean`` and ``variance`` [C] are those of y. The dense layer's bias is the offset: left out
-        of y, it costs the variance no digits.
+        The dense layer's bias is the offset: left out of y, it costs the variance no digits.
         """
         size = self.features // self.num_groups
 
@@ -88,8 +87,8 @@ def norm_relu(
 ) -> jax.Array:
     """ReLU of the normalised ``x @ kernel + bias``, see `DenseNormRelu`.
 
-    Where x is much narrower than the product, the moments of x give those of the product, and the
-    normalisation goes into the kernel: the product is written once, as the answer.
+    For x much narrower than the product, the moments of x give the product's and the normalisation
+    goes into the kernel: the product is written once, as the answer.
     """
     lead = (1,) * (x.ndim - 1)
     if 2 * x.shape[-1] <= kernel.shape[1]:
@@ -104,8 +103,8 @@ def norm_relu(
 class DenseNormReluMax(NormedLayer):
     """`DenseNormRelu`, then the maximum over the neighbours.
 
-    The maximum commutes with the normalisation, which is monotone per channel: where it falls, the
-    kernel's sign is turned first.
+    It commutes with a map that is monotone per channel; where the map falls, the kernel's sign is
+    turned first.
     """
 
     @nn.compact

@@ -1,14 +1,11 @@
 """The paper's measures of a registration, and two that do not depend on a choice of axes.
 
-Poses and clouds come in one unit, unit-sphere units as a rule, with the part's centre at the origin
-of the target's frame; ``unit_mm`` is the length of that unit in mm (the part's radius), and results
-are in millimetres and degrees. What is not finite stays not finite: only `summary` leaves it out,
-and counts it. `pose_errors` and `summary` run on the host, the rest is pure JAX.
+Poses and clouds come in unit-sphere units, with the part's centre at the origin of the target's
+frame; ``unit_mm`` is the part's radius, and results are in mm and degrees. What is not finite stays
+so: only `summary` leaves it out. `pose_errors` and `summary` run on the host, the rest in JAX.
 """
 
 from __future__ import annotations
-
-import functools
 
 import flax.struct
 import jax
@@ -59,9 +56,8 @@ def rotation_error_deg(found: RigidTransform, truth: RigidTransform) -> jax.Arra
 def translation_error(found: RigidTransform, truth: RigidTransform) -> jax.Array:
     """Length [...] of the translation of ``found @ truth.inverse()``, in the poses' unit.
 
-    For poses target_from_source this is how far the target frame's origin, the part's centre, ends
-    up from where it belongs. The difference of the two poses' own translations (eqs 9 and 11)
-    tells the same of the *source* frame's origin, wherever the random pose put it.
+    How far the part's centre ends up from where it belongs; the difference of the poses' own
+    translations (eqs 9 and 11) tells the same of the *source* frame's origin.
     """
     return jnp.linalg.norm((found @ truth.inverse()).translation, axis=-1)
 
@@ -129,8 +125,7 @@ def rmse(offsets: jax.Array, mask: jax.Array) -> jax.Array:
 def ffmde_signed(offsets: jax.Array, normals: jax.Array, mask: jax.Array) -> jax.Array:
     """Eq. 2 as printed: ``1/N sum_i n_i . (y_i - x_i)`` [], face-to-face mean distance error.
 
-    A bias: positive where the source lies inside the part's surface. Errors of opposite sign
-    cancel, so that a bad registration can reach zero.
+    Positive inside the part's surface. Errors of opposite sign cancel: a bad fit can reach zero.
     """
     return _mean(jnp.sum(normals * offsets, axis=-1), mask)
 
@@ -151,18 +146,17 @@ def surface_fit(moved: PointCloud, reference: PointCloud, *, unit_mm: float) -> 
 
 
 def summary(values: np.ndarray) -> dict[str, float | int]:
-    """``mean``, ``median``, ``p95``, ``max`` of the finite values, and how many are ``non_finite``.
-
-    The first four are NaN if nothing is finite; p95 interpolates between ranks.
-    """
+    """Measures of the finite values, NaN if there is none, and how many are ``non_finite``."""
     values = np.asarray(values, np.float64).ravel()
     finite = values[np.isfinite(values)]
-    p95 = functools.partial(np.percentile, q=95)
-    measures = {"mean": np.mean, "median": np.median, "p95": p95, "max": np.max}
+    some = finite if finite.size else np.array([np.nan])
     return {
-        name: float(measure(finite)) if finite.size else float("nan")
-        for name, measure in measures.items()
-    } | {"non_finite": int(values.size - finite.size)}
+        "mean": float(np.mean(some)),
+        "median": float(np.median(some)),
+        "p95": float(np.percentile(some, 95)),
+        "max": float(np.max(some)),
+        "non_finite": values.size - finite.size,
+    }
 
 
 def _mean(values: jax.Array, mask: jax.Array) -> jax.Array:

@@ -13,9 +13,8 @@ from vanejax.rigid import RigidTransform
 def nearest_rotation(matrix: jax.Array) -> jax.Array:
     """The rotation [..., 3, 3] that maximises ``trace(R^T matrix)``: Kabsch's projection on SO(3).
 
-    ``U diag(1, 1, det(U V^T)) V^T`` of the singular value decomposition. Its derivative is written
-    out below, since that of the SVD itself is infinite for equal singular values (a sphere) and
-    for two vanishing ones (a line), where the rotation is still well defined or harmless.
+    Its derivative is written out below: that of the SVD is infinite for equal singular values (a
+    sphere) and two vanishing ones (a line), where the rotation is well defined or harmless.
     """
     u, _, vt = _rotating_svd(matrix)
     return matmul(u, vt)
@@ -25,9 +24,8 @@ def nearest_rotation(matrix: jax.Array) -> jax.Array:
 def _nearest_rotation_jvp(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple:
     """With M = R S, S symmetric with eigenvalues s_i: R^T dR is the skew W with W S + S W = skew.
 
-    In the eigenbasis of S that is W_ij = (R^T dM - dM^T R)_ij / (s_i + s_j). The sums vanish only
-    where the rotation is not unique (s_1 = s_2 = 0, or s_2 = -s_3 of a reflection); the tangent is
-    set to zero there.
+    In the eigenbasis of S that is W_ij = (R^T dM - dM^T R)_ij / (s_i + s_j); set to zero where the
+    rotation is not unique (s_1 = s_2 = 0, or s_2 = -s_3 of a reflection) and the sums vanish.
     """
     (matrix,), (d_matrix,) = primals, tangents
     u, s, vt = _rotating_svd(matrix)
@@ -51,13 +49,11 @@ def weighted_procrustes(source: jax.Array, target: jax.Array, weights: jax.Array
     """The motion that brings ``source`` nearest to ``target`` in the weighted least-squares sense.
 
     Args:
-      source: [..., N, 3] f32.
-      target: [..., N, 3] f32, the partner of each source point.
+      source, target: [..., N, 3] f32, points and their partners.
       weights: [..., N] f32, not negative; zero removes a pair, all zero give the identity.
 
     Returns:
-      target_from_source, differentiable with finite gradients for planar, linear, coincident and
-      mirrored point sets.
+      target_from_source; its gradients are finite for planar, linear, coincident and mirrored sets.
 
     Source: Arun, Huang and Blostein (1987); Kabsch (1976); RPM-Net, section 4.3.
     """

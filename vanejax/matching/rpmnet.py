@@ -18,6 +18,7 @@ parameters, computed faster. Coordinates are in unit-sphere units of the part.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import flax.linen as nn
 import flax.struct
@@ -27,9 +28,6 @@ import jax.numpy as jnp
 from vanejax.matching.features import point_pair_features
 from vanejax.matching.procrustes import weighted_procrustes
 from vanejax.matching.sinkhorn import sinkhorn, soft_correspondences
-from vanejax.matching.torch_weights import (
-    rpmnet_variables as variables_from_torch,  # noqa: F401  # the name in older scripts
-)
 from vanejax.pointcloud import PointCloud, ball_query
 from vanejax.rigid import RigidTransform
 from vanejax.settings import Settings, multiple_of, positive, settings_class
@@ -44,8 +42,8 @@ class Match:
       log_assignment: [N, M] f32; its exponential is exactly 0 at padding.
       partners: [N, 3] f32, the soft correspondence of each source point.
       weights: [N] f32, row sums of the assignment; 0 at padding.
-      alpha: [] f32, squared feature distance at which a pair is as good as the slack.
-      beta: [] f32, annealing: how sharply distance counts.
+      alpha, beta: [] f32, squared feature distance at which a pair is as good as the slack, and
+        annealing: how sharply distance counts.
     """
 
     target_from_source: RigidTransform
@@ -81,15 +79,19 @@ class FeatureNet(nn.Module):
     """Local features: shared MLP over the neighbours, maximum, MLP, unit length."""
 
     width: int = 96
+    layer: Any = DenseNormRelu
 
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array) -> jax.Array:
         """From x [N, K, 10] = [xyz, offset, PPF] and mask [N] to [N, width] f32, unit length."""
         for layer, features in enumerate((self.width, self.width, 2 * self.width)):
-            x = DenseNormRelu(features, name=f"prepool_{layer}")(x, mask)
-        x = jnp.max(x, axis=1)
+            x = self.layer(features, name=f"prepool_{layer}")(x, mask)
+        return self.postpool(jnp.max(x, axis=1), mask)
+
+    def postpool(self, x: jax.Array, mask: jax.Array) -> jax.Array:
+        """From the maxima [N, 2 width] to [N, width] f32, unit length."""
         for layer, features in enumerate((2 * self.width, self.width)):
-            x = DenseNormRelu(features, name=f"postpool_{layer}")(x, mask)
+            x = self.layer(features, name=f"postpool_{layer}")(x, mask)
         x = nn.Dense(self.width, name="postpool_2")(x)
         # the length is sanitised, never divided by: at padding it may be 0
         return x * jax.lax.rsqrt(jnp.maximum(jnp.sum(x**2, -1, keepdims=True), 1e-20))
@@ -98,19 +100,23 @@ class FeatureNet(nn.Module):
 class AnnealingNet(nn.Module):
     """Predicts the annealing parameters from the two clouds as they lie now."""
 
+    layer: Any = DenseNormRelu
+
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
         """From `both_clouds` to beta [] and alpha [], both positive."""
         for layer, features in enumerate((64, 64, 64, 128)):
-            x = DenseNormRelu(features, name=f"prepool_{layer}")(x, mask)
-        x = DenseNormRelu(1024, num_groups=16, name="prepool_4")(x, mask)
-        x = jnp.max(x, axis=0, keepdims=True, where=mask[:, None], initial=0.0)
+            x = self.layer(features, name=f"prepool_{layer}")(x, mask)
+        x, real = self.maximum(x, mask), jnp.ones(1, bool)
         for layer, features in enumerate((512, 256)):
-            x = DenseNormRelu(features, num_groups=16, name=f"postpool_{layer}")(
-                x, jnp.ones(1, bool)
-            )
+            x = self.layer(features, num_groups=16, name=f"postpool_{layer}")(x, real)
         beta, alpha = nn.softplus(nn.Dense(2, name="postpool_2")(x))[0]
         return beta, alpha
+
+    def maximum(self, x: jax.Array, mask: jax.Array) -> jax.Array:
+        """The last layer of the points, and its maximum over the real ones: [1, 1024]."""
+        x = self.layer(1024, num_groups=16, name="prepool_4")(x, mask)
+        return jnp.max(x, axis=0, keepdims=True, where=mask[:, None], initial=0.0)
 
 
 def both_clouds(source: PointCloud, target: PointCloud) -> tuple[jax.Array, jax.Array]:
@@ -197,10 +203,8 @@ class RpmNet(nn.Module, RpmNetSettings):
         """One iteration from the pose ``target_from_source``."""
         moved = source.transform(target_from_source)
         beta, alpha = self.annealing_net(*both_clouds(moved, target))
-        features = self.features(moved), self.features(target)
-        return match_features(
-            source, target, *features, alpha, beta, self.sinkhorn_iterations, sinkhorn
-        )
+        pair = source, target, self.features(moved), self.features(target)
+        return match_features(*pair, alpha, beta, self.sinkhorn_iterations, sinkhorn)
 
     def __call__(
         self, source: PointCloud, target: PointCloud, init: RigidTransform, iterations: int

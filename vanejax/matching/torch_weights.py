@@ -1,8 +1,7 @@
 """Weights of published PyTorch networks as numpy arrays and as Flax variables.
 
-A PyTorch file is read by ``torch.load(weights_only=True)``, so nothing in it is run; that needs the
-extra ``vanejax[torch]``. Once converted (`vanejax export FILE.pth --out FILE.safetensors`), the
-weights are read without.
+Nothing in a PyTorch file is run (``torch.load(weights_only=True)``); reading it needs the extra
+``vanejax[torch]``, once: `vanejax export FILE.pth --out FILE.safetensors`.
 """
 
 from __future__ import annotations
@@ -68,8 +67,7 @@ def convert_state_dict(
 ) -> tuple[str, dict[str, np.ndarray]]:
     """Writes the weights of a published RPM-Net or PointNetLK as safetensors (or .npz).
 
-    Returns:
-      The network's name, and its state dict.
+    Returns the network's name and its state dict.
 
     Raises:
       InputError: as `load_state_dict`, or these are the weights of neither network.

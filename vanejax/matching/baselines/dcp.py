@@ -8,7 +8,7 @@ point counting alike. There is no slack: each source point has a partner, whethe
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import flax.struct
@@ -32,8 +32,7 @@ from vanejax.rigid import RigidTransform
 from vanejax.settings import Settings, positive, settings_class
 
 
-@flax.struct.dataclass
-class Embedding:
+class Embedding(NamedTuple):
     """A cloud as far as it depends on no other: features [N, width] f32 of `Dgcnn`, and encoded."""
 
     features: jax.Array

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import flax.struct
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
@@ -14,8 +15,7 @@ _EXACT = jax.lax.Precision.HIGHEST
 _FAR = 1e9  # feature distance of padding: above any real one, and finite
 
 
-@flax.struct.dataclass
-class Matches:
+class Matches(NamedTuple):
     """Pairs of a source and a target point that look alike, in P rows.
 
     Indices ``source`` and ``target`` [P] i32; ``mask`` [P] bool is False where a row is no match.
@@ -26,8 +26,7 @@ class Matches:
     mask: jax.Array
 
 
-@flax.struct.dataclass
-class Triangles:
+class Triangles(NamedTuple):
     """Three matches each: rows [T, 3] i32 of the matches, and whether one motion explains them."""
 
     rows: jax.Array

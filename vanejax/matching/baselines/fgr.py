@@ -33,9 +33,8 @@ def fgr(
     Matches of features that are mutual and pass the test of tuples, each counted as often as it
     passes, are laid on each other under the Geman-McClure kernel: it starts as wide as the clouds
     and narrows to ``max_distance`` (graduated non-convexity), and the line process
-    ``l = (mu / (mu + r^2))^2`` gives the weights of the next step (eq. 6). The paper takes one
-    Gauss-Newton step of the weighted least squares; here the weighted Procrustes problem is solved
-    outright, which is the minimum that step aims at.
+    ``l = (mu / (mu + r^2))^2`` gives the weights of the next step (eq. 6), each the weighted
+    Procrustes problem, at whose minimum the paper's one Gauss-Newton step aims.
 
     Args:
       feature_radius: of an FPFH neighbourhood, in the clouds' unit.

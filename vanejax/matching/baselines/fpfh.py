@@ -20,10 +20,8 @@ def fpfh(cloud: PointCloud, *, radius: float) -> jax.Array:
 
     Three angles of Darboux's frame between a point and each of its neighbours fall into 11 bins
     each, in percent of the neighbours (SPFH). The neighbours' histograms, weighted by 1 /
-    distance^2 and scaled to a sum of 100 per angle, are added to the point's own, as Open3D does.
-
-    Opposite faces of a plate turn by exactly half a turn, where Open3D's rounding chooses between
-    the first and the last bin of the first angle. Here such pairs always fall into the last.
+    distance^2 and scaled to a sum of 100 per angle, are added to the point's own, as Open3D does;
+    but half a turn, as of opposite faces of a plate, is always the last bin of the first angle.
 
     Args:
       cloud: [N] with unit normals; padding is no one's neighbour.
@@ -71,10 +69,7 @@ def fpfh(cloud: PointCloud, *, radius: float) -> jax.Array:
 
 
 def _darboux_bins(rows: PointCloud, cloud: PointCloud) -> list[jax.Array]:
-    """Bins [B, N] i32, 0 to 10, of the three angles between ``rows`` [B] and ``cloud`` [N].
-
-    Each angle follows from dot products alone, and its bin without an arc tangent.
-    """
+    """Bins [B, N] i32, 0 to 10, of the three angles between ``rows`` [B] and ``cloud`` [N]."""
     (ax, ay, az), (bx, by, bz), (dx, dy, dz) = (
         [rows.normals[:, None, k] for k in range(3)],
         [cloud.normals[None, :, k] for k in range(3)],
@@ -111,8 +106,8 @@ def _bin_of_cosine(cosine: jax.Array) -> jax.Array:
 def _histogram(bins: jax.Array, near: jax.Array) -> jax.Array:
     """How many of the ``near`` [B, N] fall into each bin: [B, 11] i32.
 
-    Several bins are counted in one sum: six bits of an i32 each, which hold the 63 columns of a
-    tile. One sum per bin takes twice as long.
+    One sum counts several bins, six bits of an i32 each, which hold a tile's 63 columns: half the
+    time of one sum per bin.
     """
     short = -bins.shape[1] % 63
     tiles = jnp.pad(jnp.where(near, bins, _BINS), ((0, 0), (0, short)), constant_values=_BINS)

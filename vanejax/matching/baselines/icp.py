@@ -6,7 +6,8 @@ size. Besl and McKay (1992), Chen and Medioni (1992).
 
 from __future__ import annotations
 
-import flax.struct
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
@@ -21,8 +22,7 @@ METRICS = ("point_to_point", "point_to_plane")
 KERNELS = ("none", "huber", "tukey")
 
 
-@flax.struct.dataclass
-class Pairs:
+class Pairs(NamedTuple):
     """Moved source points and their nearest target points.
 
     Moved points, partners and the partners' normals [N, 3] f32 in the target's frame; the squared
@@ -36,8 +36,7 @@ class Pairs:
     kept: jax.Array
 
 
-@flax.struct.dataclass
-class _Search:
+class _Search(NamedTuple):
     """Where the loop stands: the pose so far, iterations done, and whether it came to rest."""
 
     target_from_source: RigidTransform
@@ -74,11 +73,8 @@ def icp(
       kernel_width: of ``huber`` and ``tukey``.
       trim: share of the real source points whose pairs are kept, the nearest ones; in (0, 1].
         Trimmed ICP (Chetverikov et al., 2002).
-      tolerance_rotation_deg: an update that turns by less is at rest.
-      tolerance_translation: as well as one that moves the source's centre by less.
-
-    Returns:
-      A deterministic `Register`; the key is not used.
+      tolerance_rotation_deg, tolerance_translation: an update that turns by less, and moves the
+        source's centre by less, is at rest.
 
     Raises:
       InputError: an unknown name, a length that is not positive, a share outside (0, 1].
@@ -212,8 +208,7 @@ def _plane_system(
 def _plane_update(pairs: Pairs, weights: jax.Array) -> RigidTransform:
     """One Gauss-Newton step: the motion of the moved source, in the target's frame.
 
-    Damped by 1e-5 of the mean curvature: in a direction that nothing holds, the right side is
-    rounding, and divided by rounding it would be any motion at all.
+    Damped by 1e-5 of the mean curvature: what nothing holds is rounding divided by rounding.
     """
     matrix, right, centre, size = _plane_system(pairs, weights)
     damping = 1e-5 * jnp.trace(matrix) / 6 + 1e-12

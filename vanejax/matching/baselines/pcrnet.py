@@ -92,7 +92,8 @@ def _rotation(quaternion: jax.Array) -> jax.Array:
     squared = jnp.sum(quaternion**2)
     unit = quaternion * jax.lax.rsqrt(jnp.maximum(squared, 1e-20))
     k = hat(unit[1:])
-    return jnp.eye(3, dtype=k.dtype) + 2 * unit[0] * k + 2 * matmul(k, k)
+    square = matmul(k, k)
+    return jnp.eye(3, dtype=k.dtype) + 2 * unit[0] * k + 2 * square
 
 
 def pcrnet(

@@ -8,10 +8,9 @@ lengths are in unit-sphere units of the part.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.linen as nn
-import flax.struct
 import jax
 import jax.numpy as jnp
 
@@ -28,8 +27,7 @@ from vanejax.rigid import RigidTransform
 from vanejax.settings import Settings, not_negative, one_of, positive, settings_class
 
 
-@flax.struct.dataclass
-class Template:
+class Template(NamedTuple):
     """What does not change while sources are aligned to one target.
 
     The mean [3] of its points, about which it is described, its feature [C], and the Jacobian's
@@ -41,8 +39,7 @@ class Template:
     twist_from_feature: jax.Array
 
 
-@flax.struct.dataclass
-class LucasKanadeSteps:
+class LucasKanadeSteps(NamedTuple):
     """All iterations of PointNetLK, along a leading axis I.
 
     Attributes:

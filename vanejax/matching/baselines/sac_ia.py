@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 
@@ -114,8 +113,7 @@ def sac_ia(
     return register
 
 
-@flax.struct.dataclass
-class _Surface:
+class _Surface(NamedTuple):
     """The target [M], made ready for many searches of the nearest point.
 
     Nearest in position and normal at once, ``|p - q|^2 + d^2 |n_p - n_q|^2`` with d the largest

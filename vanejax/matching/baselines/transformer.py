@@ -7,8 +7,9 @@ alone, `Encoded`, is computed once per cloud: it serves both directions and many
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import flax.linen as nn
-import flax.struct
 import jax
 import jax.numpy as jnp
 
@@ -18,8 +19,7 @@ _EPSILON = 1e-6  # added to the standard deviation, as published
 _MASKED = -1e9  # its exponential is exactly zero beside any real score
 
 
-@flax.struct.dataclass
-class Encoded:
+class Encoded(NamedTuple):
     """What a cloud [N] brings to a pairing with any other; H heads of D = width / H channels.
 
     Attributes:
