@@ -203,13 +203,7 @@ def test_without_points_there_is_no_fit(empty: str) -> None:
 def test_summary_of_known_values() -> None:
     expected = {"mean": 50.0, "median": 50.0, "p95": 95.0, "max": 100.0, "non_finite": 0}
     assert metrics.summary(np.arange(101)) == expected
-
-
-def test_summary_counts_what_it_leaves_out() -> None:
-    found = metrics.summary(np.array([1.0, np.nan, 3.0, np.inf]))
-    assert found["non_finite"] == 2
-    assert found["mean"] == found["median"] == 2.0
-    assert found["max"] == 3.0
+    assert metrics.summary(np.r_[np.nan, np.arange(101), np.inf]) == expected | {"non_finite": 2}
 
 
 @pytest.mark.parametrize("values", [[], [np.nan, -np.inf]])

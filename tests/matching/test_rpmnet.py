@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.special
-from network_clouds import scattered
+from network_clouds import assert_reached_but_no_padding, assert_same, scattered
 from published_rpmnet import state_dict
 from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
@@ -163,15 +163,16 @@ def test_the_plain_form_is_the_numpy_twin():
     """Padded, while the twin knows no padding: padding changes nothing."""
     rows, columns = (points.mask for points in clouds())
     for (match, _), expected in zip(iterations(plain), twin_matches(), strict=True):
-        pose = match.target_from_source
-        np.testing.assert_allclose(pose.rotation, expected["rotation"], atol=EXACT)
-        np.testing.assert_allclose(pose.translation, expected["translation"], atol=EXACT)
-        np.testing.assert_allclose(match.weights[rows], expected["weights"], atol=EXACT)
-        np.testing.assert_allclose(match.partners[rows], expected["partners"], atol=EXACT)
         log_assignment = match.log_assignment[rows][:, columns]
         np.testing.assert_allclose(log_assignment, expected["log_assignment"], atol=100 * EXACT)
-        np.testing.assert_allclose(match.alpha, expected["alpha"], rtol=EXACT)
-        np.testing.assert_allclose(match.beta, expected["beta"], rtol=EXACT)
+        found = match.target_from_source._asdict() | {
+            "weights": match.weights[rows],
+            "partners": match.partners[rows],
+            "alpha": match.alpha,
+            "beta": match.beta,
+        }
+        for name, value in found.items():
+            np.testing.assert_allclose(value, expected[name], atol=EXACT, rtol=EXACT, err_msg=name)
         np.testing.assert_array_equal(match.weights[~rows], 0)
     # the problem is one in which something happens: some points match, some go to the slack
     first, second = twin_matches()
@@ -193,16 +194,11 @@ def test_the_fast_form_is_the_plain_one():
             (m.target_from_source, m.partners[rows], m.weights, m.alpha, m.beta)
             for m in (match, plain_match)
         )
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=EXACT), found, expected)
-        # slopes of up to 10
-        jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, atol=10 * EXACT), slopes, plain_slopes
-        )
+        assert_same(found, expected, EXACT)
+        assert_same(slopes, plain_slopes, 10 * EXACT)  # of up to 10
         to_weights, *to_clouds = slopes
         assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(to_weights))
-        for slope, mask in zip(to_clouds, (rows, columns), strict=True):
-            np.testing.assert_array_equal(slope[~mask], 0)
-            assert np.abs(slope[mask]).max(axis=1).min() > 0
+        assert_reached_but_no_padding(to_clouds, clouds())
 
 
 def test_a_call_gives_all_iterations():
@@ -211,20 +207,13 @@ def test_a_call_gives_all_iterations():
         call = quick_jit(MODEL.apply, static_argnums=4)
         found = call(variables(np.float64), *clouds(np.float64), init, 2)
     for match, (expected, _) in zip(found, iterations(plain), strict=True):
-        jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, atol=100 * EXACT), match, expected
-        )
+        assert_same(match, expected, 100 * EXACT)
 
 
 def test_both_forms_have_the_published_parameters():
     source, target = clouds()
-    made = jax.eval_shape(
-        lambda *args: RpmNet().init(*args, 1),
-        jax.random.key(0),
-        source,
-        target,
-        RigidTransform.identity(),
-    )
+    init = jax.random.key(0), source, target, RigidTransform.identity()
+    made = jax.eval_shape(lambda *args: RpmNet().init(*args, 1), *init)
     assert sum(leaf.size for leaf in jax.tree.leaves(made)) == 905_154
     assert jax.tree.map(np.shape, variables()) == jax.tree.map(lambda leaf: leaf.shape, made)
     # flax refuses parameters of another shape, in the fast form too
@@ -291,16 +280,9 @@ def test_parity_with_the_published_code(form, pairs):
 # ---- the method
 
 
-@functools.cache
-def registered():
-    return quick_jit(fast_rpmnet.rpmnet(MODEL, variables(), iterations=1))
-
-
-KEY = jax.random.key(0)
-
-
 def test_registration_says_what_it_rests_on():
-    result = registered()(*clouds(), RigidTransform.identity(), KEY)
+    register = quick_jit(fast_rpmnet.rpmnet(MODEL, variables(), iterations=1))
+    result = register(*clouds(), RigidTransform.identity(), jax.random.key(0))
     expected = twin_matches()[0]
     moved = problem()[0] @ expected["rotation"].T + expected["translation"]
     squared = np.sum((moved - expected["partners"]) ** 2, -1)
@@ -316,14 +298,11 @@ def test_the_last_match_is_the_last_of_all_and_shares_what_it_is_given():
 
     @quick_jit
     def last(variables, source, target):
-        shared = {
-            "near": fast_rpmnet.neighborhoods(MODEL, source),
-            "target_features": fast_rpmnet.features(MODEL, variables, target),
-        }
+        near = fast_rpmnet.neighborhoods(MODEL, source)
+        features = fast_rpmnet.features(MODEL, variables, target)
+        shared = {"near": near, "target_features": features, "iterations": 2}
         init = RigidTransform.identity()
-        return fast_rpmnet.last_match(
-            MODEL, variables, source, target, init, iterations=2, **shared
-        )
+        return fast_rpmnet.last_match(MODEL, variables, source, target, init, **shared)
 
     found = last(variables(), source, target).target_from_source
     expected = twin_matches()[1]

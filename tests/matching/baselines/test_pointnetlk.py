@@ -73,6 +73,7 @@ def run(model, weights, source, target, init, iterations=4):
 
 MODEL = PointNetLK()
 KEY = jax.random.key(0)
+describe = quick_jit(functools.partial(MODEL.apply, method="template"))
 register = quick_jit(pointnetlk(MODEL, variables(), iterations=4))
 
 
@@ -106,12 +107,6 @@ def slow_move(matrix: np.ndarray, xyz: np.ndarray) -> np.ndarray:
     return xyz @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def slow_shift(offset: np.ndarray) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, 3] = offset
-    return matrix
-
-
 def slow_pointnetlk(
     source: np.ndarray, target: np.ndarray, iterations: int, origin: str
 ) -> list[np.ndarray]:
@@ -121,18 +116,14 @@ def slow_pointnetlk(
     source_mean = source.mean(axis=0) if origin == "means" else target_mean
     template, source = target - target_mean, source - source_mean
     feature = slow_feature(template)
-    jacobian = np.stack(
-        [
-            (feature - slow_feature(slow_move(slow_exp(-DELTA * axis), template))) / DELTA
-            for axis in np.eye(6)
-        ],
-        axis=1,
-    )
-    inverse, total, totals = np.linalg.pinv(jacobian), np.eye(4), []
+    moved = (slow_move(slow_exp(-DELTA * axis), template) for axis in np.eye(6))
+    jacobian = np.array([(feature - slow_feature(points)) / DELTA for points in moved])
+    there, back = (slow_exp(np.r_[0, 0, 0, shift]) for shift in (target_mean, -source_mean))
+    inverse, total, totals = np.linalg.pinv(jacobian.T), np.eye(4), []
     for _ in range(iterations):
         step = -inverse @ (slow_feature(slow_move(total, source)) - feature)
         total = slow_exp(step) @ total
-        totals.append(slow_shift(target_mean) @ total @ slow_shift(-source_mean))
+        totals.append(there @ total @ back)
     return totals
 
 
@@ -155,9 +146,7 @@ def test_the_residual_is_what_the_steps_came_from():
     centered = source - source.mean(axis=0), target - target.mean(axis=0)
     expected = slow_feature(centered[0]) - slow_feature(centered[1])
     np.testing.assert_allclose(found.residual[0], expected, atol=2e-5)  # f32 eps x 100
-    template = quick_jit(functools.partial(MODEL.apply, method="template"))(
-        variables(), cloud(target, ROWS)
-    )
+    template = describe(variables(), cloud(target, ROWS))
     steps = -found.residual @ template.twist_from_feature.T
     np.testing.assert_allclose(found.twist, steps, atol=1e-5)
 
@@ -272,7 +261,6 @@ def test_parity_with_the_published_weights():
     weights = pointnetlk_variables(
         {name[2:]: value for name, value in io.items() if name.startswith("w:")}
     )
-    describe = quick_jit(functools.partial(MODEL.apply, method="template"))
     for pair in range(3):
         source, target = (cloud(io[name][pair], 1024) for name in ("source", "template"))
         feature = describe(weights, target).feature
