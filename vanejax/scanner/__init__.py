@@ -10,8 +10,7 @@ from vanejax.scanner.clutter import Clutter, clutter_scene
 from vanejax.scanner.ideal_scan import Hits, Scan
 from vanejax.scanner.measurement import Measurement, Reason, measure
 from vanejax.scanner.sensor import Sensor, preset
-from vanejax.scanner.viewpoint_scans import scan_views
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner.virtual_scanner import Scanner, scan_views
 
 __all__ = [
     "Camera",
