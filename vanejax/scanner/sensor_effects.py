@@ -99,8 +99,7 @@ class SensedView:
 
 def projector_shadow(view: SensedView) -> np.ndarray:
     """What the projector does not light."""
-    scan = view.scan
-    return ~view.scanner.lit(scan.points, scan.normals, view.to_projector, scan.camera_from_part)
+    return ~view.scanner.lit(view.scan, view.to_projector)
 
 
 def grazing_incidence(view: SensedView) -> np.ndarray:

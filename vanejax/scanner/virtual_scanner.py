@@ -211,30 +211,19 @@ class Scanner:
         seen[inside] = ~blocked & (np.abs(cosine) > EDGE_ON_COSINE)
         return camera_from_local.apply(points_local[~seen]).astype(np.float32)
 
-    def lit(
-        self,
-        points: np.ndarray,
-        normals: np.ndarray,
-        towards: np.ndarray,
-        camera_from_part: RigidTransform,
-    ) -> np.ndarray:
-        """[N] bool, whether light reaches the points and normals [N, 3] f32 of a `Scan`.
+    def lit(self, scan: Scan, towards: np.ndarray) -> np.ndarray:
+        """[N] bool, whether a light reaches a scan's points; it lies ``towards`` [N, 3] f32 mm.
 
-        It lies ``towards`` [N, 3] f32 mm from each point, or [3] for parallel light, camera frame.
         What stands in between shades the point, on its own face too.
         """
-        rotation = np.asarray(camera_from_part.rotation, np.float64)
-        center = camera_from_part.apply(self._center[None])
-        lit = np.einsum("ni,ni->n" if towards.ndim == 2 else "ni,i->n", normals, towards) > 0
+        lit = np.einsum("ni,ni->n", scan.normals, towards) > 0
         facing = np.flatnonzero(lit)
-        starts = points.take(facing, axis=0) - center.astype(np.float32)
-        starts += np.float32(LIFT * self._radius) * normals.take(facing, axis=0)
-        ways = towards.take(facing, axis=0) if towards.ndim == 2 else towards[None]
-        turn = rotation.astype(np.float32)
-        ways = np.broadcast_to(turned(ways, turn), starts.shape)
-        lit[facing] = ~self._scene.is_blocked(
-            turned(starts, turn), np.ascontiguousarray(ways), np.ones(len(facing))
-        )
+        center = scan.camera_from_part.apply(self._center[None])
+        starts = scan.points.take(facing, axis=0) - center.astype(np.float32)
+        starts += np.float32(LIFT * self._radius) * scan.normals.take(facing, axis=0)
+        turn = scan.camera_from_part.rotation.astype(np.float32)
+        ways = turned(towards.take(facing, axis=0), turn)
+        lit[facing] = ~self._scene.is_blocked(turned(starts, turn), ways, np.ones(len(facing)))
         return lit
 
     def _refuse_camera_inside(self, camera_from_local: RigidTransform) -> None:
