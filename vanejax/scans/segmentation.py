@@ -133,9 +133,11 @@ def _part_of(
     order = np.argsort(-supports.count, kind="stable")
     large = order[: np.count_nonzero(supports.count >= LEAST_PIECE * supports.count[order[0]])]
     chosen = _likeliest(supports, large[:MOST_PIECES], wanted, allowed)
-    main_piece = supports.together(chosen)
+    low, high = supports.low[chosen].min(axis=0), supports.high[chosen].max(axis=0)
+    allowed = np.maximum(allowed, np.sort(high - low))
     small = np.setdiff1d(order, large)
-    fits = np.all(supports.widths(main_piece)[small] <= np.maximum(allowed, main_piece.widths()), 1)
+    with_small = np.maximum(high, supports.high[small]) - np.minimum(low, supports.low[small])
+    fits = np.all(np.sort(with_small, axis=1) <= allowed, axis=1)
     if tables:
         above = [table.height_mm(voxels.middle) - table.thickness_mm for table in tables]
         height = np.min(above, axis=0)
@@ -166,24 +168,13 @@ class _Supports:
         first = np.cumsum(count) - count
         return cls(np.minimum.reduceat(along, first), np.maximum.reduceat(along, first), count)
 
-    def together(self, which: np.ndarray) -> _Supports:
-        """Pieces as one."""
-        return _Supports(
-            self.low[which].min(axis=0, keepdims=True),
-            self.high[which].max(axis=0, keepdims=True),
-            self.count[which].sum(keepdims=True),
-        )
-
-    def widths(self, other: _Supports | None = None) -> np.ndarray:
-        """[K, D] mm, ascending, of each piece, or of each with one other.
+    def widths(self) -> np.ndarray:
+        """[K, D] mm, ascending, of each piece.
 
         Whatever is a piece of the part is, in every order statistic, at most as wide as the part,
         however it is turned.
         """
-        low, high = self.low, self.high
-        if other is not None:
-            low, high = np.minimum(low, other.low), np.maximum(high, other.high)
-        return np.sort(high - low, axis=1)
+        return np.sort(self.high - self.low, axis=1)
 
 
 def _likeliest(
