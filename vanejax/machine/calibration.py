@@ -1,12 +1,9 @@
 """Where the camera stands in the frame of a measuring machine, from a cube that both measured.
 
-Section IV.B.2 of the paper: three faces of a cube, square to each other, are scanned by the camera
-and touched by the machine's probe, at several placements. The paper registers the three faces of
-each placement and puts the eight matrices together: `averaged`. `calibrate` asks for the one
-motion that brings all planes of all placements onto each other, each weighted by how well it is
-known. It does not need the cube to be square, since both see the same three planes.
-
-Host code, float64, mm.
+Section IV.B.2 of the paper: three faces of a cube are scanned by the camera and touched by the
+machine's probe, at several placements. The paper puts one matrix of each placement together:
+`averaged`. `calibrate` asks for the one motion that brings all planes onto each other, each
+weighted by how well it is known; the cube need not be square. Host code, float64, mm.
 """
 
 from __future__ import annotations
@@ -70,18 +67,17 @@ def calibrate(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> Ca
       InputError: no cubes, or cubes that do not match.
     """
     camera_cubes = matched(camera_cubes, machine_cubes)
-    machine_from_camera, center = _aligned(camera_cubes, machine_cubes)
+    touched = [face for cube in machine_cubes for face in cube.faces]
+    machine_from_camera, center, _ = _aligned(camera_cubes, machine_cubes)
     for _ in range(20):
         information, gradient, chi = np.zeros((6, 6)), np.zeros(6), 0.0
-        for seen, touched in zip(camera_cubes, machine_cubes, strict=True):
-            for face, touched_face in zip(
-                seen.moved(machine_from_camera).faces, touched.faces, strict=True
-            ):
-                residual, jacobian, covariance = _disagreement(face, touched_face, center)
-                weighted = np.linalg.solve(covariance, np.column_stack([jacobian, residual]))
-                information += jacobian.T @ weighted[:, :6]
-                gradient += jacobian.T @ weighted[:, 6]
-                chi += float(residual @ weighted[:, 6])
+        seen = [face for cube in camera_cubes for face in cube.moved(machine_from_camera).faces]
+        for face, touched_face in zip(seen, touched, strict=True):
+            residual, jacobian, covariance = _disagreement(face, touched_face, center)
+            weighted = np.linalg.solve(covariance, np.column_stack([jacobian, residual]))
+            information += jacobian.T @ weighted[:, :6]
+            gradient += jacobian.T @ weighted[:, 6]
+            chi += float(residual @ weighted[:, 6])
         step = -np.linalg.solve(information, gradient)
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         shift = center + step[3:] - turn @ center
@@ -98,8 +94,7 @@ def averaged(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> Cal
     """machine_from_camera as the paper has it: the mean of one matrix for each placement.
 
     The rotation is the chordal mean (Hartley et al. 2013); Euler angles, which the paper averages,
-    have no mean near their poles. The translation then brings the corners onto each other, rather
-    than being the mean of eight, each of which carries its own rotation's error over 400 mm. The
+    have no mean near their poles. The translation then brings the corners onto each other. The
     covariance is that of a mean of P alike: it is NaN for one placement.
 
     Raises:
@@ -125,9 +120,8 @@ def averaged(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> Cal
 def matched(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> list[Cube]:
     """The camera's cubes with their faces named as the machine's.
 
-    A cube looks the same in three attitudes. Placed twice at different tilts, or at different
-    places, only one way of naming its faces lets one motion fit all. A single placement is taken as
-    it is given.
+    A cube looks the same in three attitudes. Placed twice at different tilts or places, only one
+    way of naming its faces lets one motion fit all. A single placement is taken as it is given.
 
     Raises:
       InputError: no cubes, not as many of each, or no way to name the faces that fits better than
@@ -140,19 +134,14 @@ def matched(camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]) -> list
         )
     fits = []
     for first in range(3 if len(camera_cubes) > 1 else 1):
-        rough = _aligned([camera_cubes[0].relabelled(first)], machine_cubes[:1])[0]
         named = [camera_cubes[0].relabelled(first)]
+        rough = _aligned(named, machine_cubes[:1])[0]
         for seen, touched in zip(camera_cubes[1:], machine_cubes[1:], strict=True):
             ways = [seen.relabelled(shift) for shift in range(3)]
             turns = [rough.rotation @ way.world_from_cube.rotation for way in ways]
             like = [np.trace(touched.world_from_cube.rotation.T @ turn) for turn in turns]
             named.append(ways[int(np.argmax(like))])
-        both = _aligned(named, machine_cubes)[0]
-        off = [
-            both.apply(_corners(seen)) - _corners(touched)
-            for seen, touched in zip(named, machine_cubes, strict=True)
-        ]
-        fits.append((float(np.sqrt(3 * np.mean(np.square(off)))), first, named))
+        fits.append((_aligned(named, machine_cubes)[2], first, named))
     (mismatch, _, best), *others = sorted(fits, key=lambda fit: fit[:2])
     if mismatch > MOST_MISMATCH_MM:
         raise InputError(
@@ -176,14 +165,15 @@ def _corners(cube: Cube) -> np.ndarray:
 
 def _aligned(
     camera_cubes: Sequence[Cube], machine_cubes: Sequence[Cube]
-) -> tuple[RigidTransform, np.ndarray]:
-    """The motion that brings the cubes' corners together, and the middle [3] of the machine's."""
+) -> tuple[RigidTransform, np.ndarray, float]:
+    """The motion that brings corners together, the middle [3] of the machine's, and the misfit."""
     seen = np.concatenate([_corners(cube) for cube in camera_cubes])
     touched = np.concatenate([_corners(cube) for cube in machine_cubes])
     start, end = seen.mean(axis=0), touched.mean(axis=0)
     rotation = Rotation.align_vectors(touched - end, seen - start)[0].as_matrix()
-    center = np.mean([cube.corner for cube in machine_cubes], axis=0)
-    return RigidTransform(rotation, end - rotation @ start), center
+    motion = RigidTransform(rotation, end - rotation @ start)
+    misfit_mm = float(np.sqrt(3 * np.mean(np.square(motion.apply(seen) - touched))))
+    return motion, np.mean([cube.corner for cube in machine_cubes], axis=0), misfit_mm
 
 
 def _disagreement(

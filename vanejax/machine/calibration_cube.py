@@ -6,9 +6,9 @@ are in. Host code, float64, mm.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,8 +28,7 @@ LEAST_SHARE = 0.02  # of the scan, the smallest face
 _LINE = 1e-3
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Face:
+class Face(NamedTuple):
     """A plane that was fitted to points.
 
     Attributes:
@@ -52,8 +51,7 @@ class Face:
         return (points - self.center) @ self.normal
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Cube:
+class Cube(NamedTuple):
     """Three faces of a cube, outward and right-handed: ``n0 x n1`` is along n2."""
 
     faces: tuple[Face, Face, Face]
@@ -61,13 +59,13 @@ class Cube:
     @property
     def corner(self) -> np.ndarray:
         """[3] mm: where the three planes meet."""
-        normals = np.stack([face.normal for face in self.faces])
+        normals = [face.normal for face in self.faces]
         return np.linalg.solve(normals, [face.normal @ face.center for face in self.faces])
 
     @property
     def world_from_cube(self) -> RigidTransform:
         """The cube's frame: origin at the corner, axes nearest (least squares) to the normals."""
-        normals = np.stack([face.normal for face in self.faces])
+        normals = [face.normal for face in self.faces]
         axes = Rotation.align_vectors(normals, np.eye(3))[0].as_matrix()
         return RigidTransform(axes, self.corner)
 
@@ -79,8 +77,7 @@ class Cube:
         """The same in another frame."""
         turn, shift = target_from_this
         faces = (
-            dataclasses.replace(
-                face,
+            face._replace(
                 normal=turn @ face.normal,
                 center=turn @ face.center + shift,
                 normal_covariance=turn @ face.normal_covariance @ turn.T,
@@ -148,13 +145,13 @@ def cube_of(
                 f"faces {i} and {j} are {askew:.2f} deg from square, more than "
                 f"{MOST_ASKEW_DEG:g}: are their points on one face each, and is it a cube?"
             )
-    outward = []
-    for face in faces:
-        # the other faces lie below it: a cube is convex
-        below = sum(face.height_mm(other.center[None])[0] for other in faces)
-        normal = face.normal if below < 0 else -face.normal
-        outward.append(dataclasses.replace(face, normal=normal))
-    if np.linalg.det(np.stack([face.normal for face in outward])) < 0:
+    centers = np.stack([face.center for face in faces])
+    # the other faces lie below each: a cube is convex
+    outward = [
+        face if face.height_mm(centers).sum() < 0 else face._replace(normal=-face.normal)
+        for face in faces
+    ]
+    if np.linalg.det([face.normal for face in outward]) < 0:
         outward[1], outward[2] = outward[2], outward[1]
     return Cube(tuple(outward))
 

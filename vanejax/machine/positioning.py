@@ -122,10 +122,7 @@ def probe_translation(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """[3] mm: the mean motion of probed points [K, 3], the true translation of eq. 12.
 
     As printed, ``1/4 sum(1P_i - jP_i)``, it is the way back from position j to the first; here it
-    is the way there, as T2 T1^-1 is.
-
-    Raises:
-      InputError: not as many points before and after, or none.
+    is the way there, as T2 T1^-1 is. Raises `InputError` for points that are not alike in number.
     """
     before, after = np.asarray(before, np.float64), np.asarray(after, np.float64)
     if before.shape != after.shape or before.ndim != 2 or before.shape[1] != 3 or not len(before):
@@ -199,8 +196,7 @@ def motion_errors(
     is ``E_B (B after^-1 (E_after^-1 E_before) after B^-1) (M E_B^-1 M^-1) M``.
 
     Args:
-      before, after: as reported.
-      part_center: [3] mm, part frame, about which their errors are.
+      part_center: [3] mm, part frame, about which the errors of the poses are.
       machine_from_camera: None: the machine's frame is the camera's.
       calibration_center: [3] mm, machine frame, about which its error is; None for its origin.
     """
