@@ -42,10 +42,8 @@ def read_triangles(path: Path, *, units: str) -> Mesh:
         raise InputError(f"unknown unit {units!r}; use one of {', '.join(MM_PER_UNIT)}")
     suffix = path.suffix.lower()
     if suffix not in READERS and path.is_file():
-        raise InputError(
-            f"{path}: cannot read {suffix or 'a file without suffix'}; use one of "
-            + ", ".join(READERS)
-        )
+        what, known = suffix or "a file without suffix", ", ".join(READERS)
+        raise InputError(f"{path}: cannot read {what}; use one of {known}")
     read_head(path, max_bytes=MAX_BYTES, advice=_COARSER)
     try:
         data = path.read_bytes()
@@ -147,12 +145,10 @@ def _scene_triangles(data: bytes, path: Path, suffix: str) -> tuple[np.ndarray, 
         ) from error
     meshes = [(m, g) for m, g in placed if isinstance(g, trimesh.Trimesh) and len(g.faces)]
     if not meshes:
-        cloud = any(isinstance(g, trimesh.PointCloud) for _, g in placed)
-        raise InputError(
-            f"{path}: holds points but no faces: a scan, not a CAD model; give the CAD file"
-            if cloud
-            else f"{path}: holds no triangles; export the solid body"
-        )
+        what = "no triangles; export the solid body"
+        if any(isinstance(g, trimesh.PointCloud) for _, g in placed):
+            what = "points but no faces: a scan, not a CAD model; give the CAD file"
+        raise InputError(f"{path}: holds {what}")
     if any(np.shape(mesh.vertices)[1:] != (3,) for _, mesh in meshes):
         raise InputError(f"{path}: damaged: a vertex is not three numbers; export it again")
     faces = sum(len(mesh.faces) for _, mesh in meshes)

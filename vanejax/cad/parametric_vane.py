@@ -205,17 +205,14 @@ def guide_vane(segment: GuideVaneSegment = DOUBLET) -> Part:
     middle = _platform_middle(segment, vane)
     pitches = (np.arange(segment.vanes) - (segment.vanes - 1) / 2) * segment.pitch_rad
     solids = [_loft(vane + np.array([0, pitch, 0]), _SECTION) for pitch in pitches]
-    half_width = 0.5 * (segment.vanes * segment.pitch_rad - segment.gap_rad)
+    width = segment.vanes * segment.pitch_rad - segment.gap_rad
     inner, outer, rail_slot = _platform_profiles(segment)
-    solids += [
-        _loft(_sweep(segment, profile, middle - half_width, middle + half_width), _PROFILE)
-        for profile in (inner, outer)
-    ]
+    solids += [_swept(segment, profile, middle, width) for profile in (inner, outer)]
     solid = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
     if segment.slot_width_mm > 0:
         left = middle - 0.25 * segment.vanes * segment.pitch_rad
         width = segment.slot_width_mm / segment.outer_radius_mm
-        solid -= _loft(_sweep(segment, rail_slot, left - width / 2, left + width / 2), _PROFILE)
+        solid -= _swept(segment, rail_slot, left, width)
     mesh = solid.simplify(_SLIVER_MM).to_mesh64()
     vertices = np.asarray(mesh.vert_properties)[:, :3]
     vertices = vertices - 0.5 * (vertices.min(0) + vertices.max(0))
@@ -327,15 +324,16 @@ def _subdivide(polygon: np.ndarray) -> np.ndarray:
     return np.concatenate(points)
 
 
-def _sweep(
-    segment: GuideVaneSegment, profile: np.ndarray, first_angle: float, last_angle: float
-) -> np.ndarray:
-    """[S, Q, 3] ring coordinates of a profile turned about the axis between two slashed ends."""
-    arc = (last_angle - first_angle) * segment.outer_radius_mm
-    angles = np.linspace(first_angle, last_angle, math.ceil(arc / _PLATFORM_STEP_MM) + 1)
+def _swept(
+    segment: GuideVaneSegment, profile: np.ndarray, middle: float, width: float
+) -> manifold3d.Manifold:
+    """A profile [Q, 2] turned about the axis by an angle ``width`` between two slashed ends."""
+    first, last = middle - width / 2, middle + width / 2
+    steps = math.ceil((last - first) * segment.outer_radius_mm / _PLATFORM_STEP_MM)
+    angles = np.linspace(first, last, steps + 1)
     axial, radius = profile.T
     turned = angles[:, None] + _slash(segment, axial)
-    return np.stack(np.broadcast_arrays(axial, turned, radius), -1)
+    return _loft(np.stack(np.broadcast_arrays(axial, turned, radius), -1), _PROFILE)
 
 
 def _loft(rings: np.ndarray, flat: tuple[int, int]) -> manifold3d.Manifold:

@@ -140,12 +140,11 @@ def outward_bodies(
         boxes = np.all((low <= low[i]) & (high[i] <= high), axis=1)
         point = mesh.points[pieces[i].faces[0, 0]]
         around = [j for j in index if j != i and boxes[j] and _contains(pieces[j], point)]
-        outermost[i] = max(around, key=lambda j: abs(volume[j]), default=None)
+        outermost[i] = max(around, key=lambda j: abs(volume[j]), default=i)
     # an inside-out body turns with all that is inside it: its cavities stay cavities
-    root = {i: i if outermost[i] is None else outermost[i] for i in index}
-    turned = [i for i in index if volume[root[i]] < 0]
-    if any(root[i] == i for i in turned):
-        inverted = sum(root[i] == i for i in turned)
+    turned = [i for i in index if volume[outermost[i]] < 0]
+    inverted = sum(outermost[i] == i for i in turned)
+    if inverted:
         notes.append(f"turned {counted(inverted, 'inside-out body')} outward")
     outward = {i: -volume[i] if i in turned else volume[i] for i in index}
     cavities = sum(value < 0 for value in outward.values())

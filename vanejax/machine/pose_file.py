@@ -156,11 +156,7 @@ def result_to_dict(
 
 
 def write_result(path: str | os.PathLike[str], result: PoseResult, **names: Any) -> None:
-    """Writes `result_to_dict` (with the same arguments) as JSON, which `read_pose` reads again.
-
-    Raises:
-      InputError: the file cannot be written.
-    """
+    """Writes `result_to_dict` (with the same arguments) as JSON, which `read_pose` reads again."""
     write_json(path, result_to_dict(result, **names), allow_nan=False)
 
 
@@ -173,11 +169,7 @@ class PoseRecord(NamedTuple):
 
 
 def read_record(path: str | os.PathLike[str]) -> PoseRecord:
-    """`read_pose`, with the verdict on it where the file has one.
-
-    Raises:
-      InputError: as `read_pose`; or the verdict is none of accepted, ambiguous, rejected.
-    """
+    """`read_pose`, with the verdict where the file has one; `InputError` for an unknown one."""
     path = Path(path)
     text = read_text(path)
     pose = parse_transform(text, where=str(path))
@@ -241,8 +233,9 @@ def read_text(path: Path) -> str:
             raise InputError(f"{path}: {size / 2**20:.0f} MiB are too large for a pose file")
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
+        where = path.parent.absolute()
         raise InputError(
-            f"{path}: no such file (looked in {path.parent.absolute()}); it should hold a pose"
+            f"{path}: no such file (looked in {where}); it should hold a pose"
         ) from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: is no text; a pose file is JSON or 16 numbers") from None
