@@ -10,16 +10,6 @@ import pytest
 
 from experiments.runner.vane_views import VaneViews, magnitudes, perturb, pose_error, with_noise
 from experiments.studies.fine import study as fine
-from experiments.studies.fine.study import (
-    against_bound,
-    basin,
-    basin_table,
-    cramer_rao,
-    main,
-    refine_view,
-    summarize,
-    table,
-)
 from vanejax.errors import InputError
 from vanejax.localization.pose_batch import stack
 from vanejax.localization.residuals import moved
@@ -86,10 +76,10 @@ def test_the_bound_is_that_of_numerical_derivatives(views: VaneViews, points: np
     assert same.mean() > 0.999
     jacobian = np.stack([(a[0] - b[0])[same] / (2 * step) for a, b in pairs], axis=1)
     expected = np.linalg.inv(jacobian.T @ jacobian) * noise_mm**2
-    found = cramer_rao(model, points, truth, noise_mm)
+    found = fine.cramer_rao(model, points, truth, noise_mm)
     # a missing ray in 1000 may carry some of the information
     np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.02)
-    np.testing.assert_allclose(cramer_rao(model, points, truth, 0.6), 4 * found, rtol=1e-9)
+    np.testing.assert_allclose(fine.cramer_rao(model, points, truth, 0.6), 4 * found, rtol=1e-9)
 
 
 def made_up(*, claimed: float = 1.0, worst: float = 1.0) -> list[dict]:
@@ -104,13 +94,13 @@ def made_up(*, claimed: float = 1.0, worst: float = 1.0) -> list[dict]:
     bound = root @ root.T
     report = {"noise_mm": 0.1, "converged": True, "iterations": 9, "points": 1000, "seconds": 0.5}
     return [
-        {"view": view, **against_bound(error, bound, claimed * bound), **report}
+        {"view": view, **fine.against_bound(error, bound, claimed * bound), **report}
         for view, error in enumerate(errors)
     ]
 
 
 def test_an_honest_and_efficient_estimate_is_seen_to_be_one() -> None:
-    report = summarize(made_up(), 0.1)
+    report = fine.summarize(made_up(), 0.1)
     # 400 views of three components each: 2 to 3 % of chance
     assert report["rotation_deg"]["ratio"] == pytest.approx(1, abs=0.1)
     assert report["translation_mm"]["ratio"] == pytest.approx(1, abs=0.1)
@@ -119,22 +109,22 @@ def test_an_honest_and_efficient_estimate_is_seen_to_be_one() -> None:
     low, high = report["anees_interval_95"]
     assert 0.94 < low < 1 < high < 1.06
     assert report["noise_estimate_ratio"] == pytest.approx(1)
-    assert table([report]).splitlines()[-1].startswith("met")
+    assert fine.table([report]).splitlines()[-1].startswith("met")
 
 
 def test_a_covariance_that_is_too_small_and_one_bad_view_are_seen() -> None:
-    small = summarize(made_up(claimed=0.25), 0.1)
+    small = fine.summarize(made_up(claimed=0.25), 0.1)
     assert small["anees"] == pytest.approx(4, abs=0.4)
     assert small["coverage_95"] < 0.5
-    bad = summarize(made_up(worst=50), 0.1)
+    bad = fine.summarize(made_up(worst=50), 0.1)
     assert bad["translation_mm"]["worst_view_ratio"] > 4
-    assert table([bad]).splitlines()[-1].startswith("MISSED")
+    assert fine.table([bad]).splitlines()[-1].startswith("MISSED")
 
 
 def test_the_study_reaches_the_bound(tmp_path: Path, monkeypatch, capsys, views: VaneViews) -> None:
     monkeypatch.setattr(fine, "VaneViews", lambda: views)
     arguments = ["--noise-mm", "0.1,0.5", "--views", "0,120", "--out", str(tmp_path)]
-    report = main(fine.make_parser().parse_args(arguments))
+    report = fine.main(fine.make_parser().parse_args(arguments))
     assert json.loads((tmp_path / "fine.json").read_text()) == report
     assert (tmp_path / "fine.png").stat().st_size > 10_000
     assert [level["noise_mm"] for level in report["levels"]] == [0.1, 0.5]
@@ -152,7 +142,7 @@ def test_draws_repeat_and_differ(views: VaneViews, points: np.ndarray) -> None:
 
     def relative_error(view: int = VIEW, noise_mm: float = 0.1, seed: int = 0) -> np.ndarray:
         ideal = points if view == VIEW else views.points(view)
-        row = refine_view(views, view, ideal, noise_mm=noise_mm, start=(5.0, 5.0), seed=seed)
+        row = fine.refine_view(views, view, ideal, noise_mm=noise_mm, start=(5.0, 5.0), seed=seed)
         return np.array([row["rotation_deg"], row["translation_mm"]]) / noise_mm
 
     first = relative_error()
@@ -164,7 +154,7 @@ def test_draws_repeat_and_differ(views: VaneViews, points: np.ndarray) -> None:
 
 def test_from_five_degrees_all_arrive() -> None:
     finer = VaneViews(camera=Camera().scaled(0.4))
-    rows = basin(finer, [VIEW], 0, degrees=(5.0,))
+    rows = fine.basin(finer, [VIEW], 0, degrees=(5.0,))
     assert [(row["start_deg"], row["start_mm"]) for row in rows] == [(5, 5), (5, 10), (5, 20)]
     assert rows[0]["arrived"] == 1.0
-    assert "100%" in basin_table(rows)
+    assert "100%" in fine.basin_table(rows)

@@ -14,32 +14,18 @@ from scipy.spatial.transform import Rotation
 from experiments.runner.vane_views import VaneViews, magnitudes, perturb, pose_error
 from experiments.studies.position import report as position_report
 from experiments.studies.position import study as position
+from experiments.studies.position import virtual_test_stand as stands
 from experiments.studies.position.study import Found, make_parser, move_rows, run_camera, turn_rows
-from experiments.studies.position.virtual_test_stand import (
-    GroundCube,
-    PlacedCube,
-    VirtualTestStand,
-    calibration_errors,
-    calibrations,
-    frame_bias,
-    place_cubes,
-    pose_bias,
-    shifts_mm,
-    stage_moves,
-    stage_turns,
-)
-from vanejax.cad.surface import Surface
+from vanejax.cad import Surface
 from vanejax.errors import InputError
-from vanejax.localization.fine_registration import refine
-from vanejax.localization.registration import register
-from vanejax.machine.calibration import Calibration
+from vanejax.localization import refine, register
+from vanejax.machine import Calibration
 from vanejax.machine.controllers import axis_angle_deg
 from vanejax.machine.positioning import camera_motion
-from vanejax.plotting.canvas import save_figure
+from vanejax.plotting import save_figure
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.measurement import measure
-from vanejax.scanner.sensor import Sensor, paper_camera
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Scanner, Sensor, measure
+from vanejax.scanner.sensor import paper_camera
 
 VIEWS = VaneViews()
 VIEW = 108
@@ -49,22 +35,22 @@ KIND = dataclasses.replace(
 )
 
 
-def build(sensor: Sensor = KIND, seed: int = 0) -> VirtualTestStand:
-    return VirtualTestStand.build(
+def build(sensor: Sensor = KIND, seed: int = 0) -> stands.VirtualTestStand:
+    return stands.VirtualTestStand.build(
         VIEWS.part, sensor, VIEWS.viewpoints.view(VIEW), np.random.default_rng(seed)
     )
 
 
-def moves_of(stand: VirtualTestStand, found: list[Found]) -> list[dict[str, Any]]:
+def moves_of(stand: stands.VirtualTestStand, found: list[Found]) -> list[dict[str, Any]]:
     """Rows of moves with the true machine frame."""
     frame = Calibration(
         stand.machine_from_camera, np.zeros((6, 6)), np.zeros(3), np.zeros(8), np.zeros(8), 1.0
     )
-    return move_rows(stand, stage_moves(12), found, frame, np.zeros((6, 10)), seed=0, salt=0)
+    return move_rows(stand, stands.stage_moves(12), found, frame, np.zeros((6, 10)), seed=0, salt=0)
 
 
 def found_at(
-    stand: VirtualTestStand, stages: list[RigidTransform], errors: list[np.ndarray]
+    stand: stands.VirtualTestStand, stages: list[RigidTransform], errors: list[np.ndarray]
 ) -> list[Found]:
     """Registrations that are off by small motions [6] in the part's frame."""
     found = []
@@ -81,7 +67,7 @@ def found_at(
 
 def test_the_stage_turns_the_part_about_its_axis():
     stand = build()
-    stages = stage_turns(12)
+    stages = stands.stage_turns(12)
     assert len(stages) == 12
     poses = [stand.truth(stage) for stage in stages]
     np.testing.assert_allclose(
@@ -99,7 +85,7 @@ def test_the_stage_turns_the_part_about_its_axis():
 
 
 def test_the_cube_is_as_flat_and_square_as_it_says():
-    block = GroundCube.ground(np.random.default_rng(3))
+    block = stands.GroundCube.ground(np.random.default_rng(3))
     surface = Surface(block.part)
     for k in range(3):
         places = np.random.default_rng(k).uniform(-55, -5, (400, 2))
@@ -120,22 +106,22 @@ def test_shifts_are_those_of_the_sensor():
     rng = np.random.default_rng(4)
     ideal = measure(scanner, Sensor(camera=KIND.camera), pose, rng).points.astype(np.float64)
     wrong = measure(scanner, KIND, pose, rng).points - ideal
-    shifts = shifts_mm(KIND, ideal)
+    shifts = stands.shifts_mm(KIND, ideal)
     assert np.abs(shifts).max() > 0.04
     # float32 at 400 mm, and the lens sees the depth after its error
     np.testing.assert_allclose(shifts, wrong, atol=3e-4)
-    apart = [shifts_mm(sensor, ideal) for sensor in calibration_errors(KIND)]
+    apart = [stands.shifts_mm(sensor, ideal) for sensor in stands.calibration_errors(KIND)]
     assert len(apart) == 10
     np.testing.assert_allclose(np.sum(apart, axis=0), shifts, atol=1e-9)
 
 
 def test_what_the_camera_does_to_a_pose_is_what_happens():
     stand = build()
-    still = stage_turns(1)[0]
+    still = stands.stage_turns(1)[0]
     scan = stand.scan(still, np.random.default_rng(5))
     truth = stand.truth(still)
     fine = refine(stand.model, scan.points, truth).part_from_camera
-    predicted = pose_bias(stand, scan, fine, calibration_errors(KIND)).sum(axis=1)
+    predicted = stands.pose_bias(stand, scan, fine, stands.calibration_errors(KIND)).sum(axis=1)
     actual = pose_error(fine, truth, stand.part.center)
     assert np.linalg.norm(actual[3:]) > 0.03
     # the refinement weighs noise it fits itself, and drops what it takes for outliers
@@ -144,14 +130,14 @@ def test_what_the_camera_does_to_a_pose_is_what_happens():
 
 
 @pytest.fixture(scope="module")
-def placed() -> tuple[VirtualTestStand, list[PlacedCube]]:
+def placed() -> tuple[stands.VirtualTestStand, list[stands.PlacedCube]]:
     stand = build(dataclasses.replace(KIND, noise_px=0.0125))
-    return stand, place_cubes(stand, np.random.default_rng(6))
+    return stand, stands.place_cubes(stand, np.random.default_rng(6))
 
 
 def test_the_cube_joins_camera_and_machine(placed):
     stand, places = placed
-    for found in calibrations(places):
+    for found in stands.calibrations(places):
         rotation_deg, translation_mm = magnitudes(
             pose_error(found.machine_from_camera, stand.machine_from_camera, found.center)
         )
@@ -162,8 +148,8 @@ def test_the_cube_joins_camera_and_machine(placed):
 
 def test_what_the_camera_does_to_the_frame_is_what_happens(placed):
     stand, places = placed
-    joint = calibrations(places)[0]
-    predicted = frame_bias(places, joint, calibration_errors(KIND)).sum(axis=1)
+    joint = stands.calibrations(places)[0]
+    predicted = stands.frame_bias(places, joint, stands.calibration_errors(KIND)).sum(axis=1)
     actual = pose_error(joint.machine_from_camera, stand.machine_from_camera, joint.center)
     assert np.linalg.norm(predicted[3:]) > 0.02
     # what is left is noise, of probe and scan
@@ -173,10 +159,10 @@ def test_what_the_camera_does_to_the_frame_is_what_happens(placed):
 def test_perfect_registrations_have_no_error():
     stand = build()
     none = [np.zeros(6)] * 12
-    turned = turn_rows(stand, stage_turns(12), found_at(stand, stage_turns(12), none))
+    turned = turn_rows(stand, stands.stage_turns(12), found_at(stand, stands.stage_turns(12), none))
     assert max(abs(row["error_deg"]) for row in turned["rows"]) < 1e-9
     assert turned["axis_error_deg"] < 1e-6
-    rows = moves_of(stand, found_at(stand, stage_moves(12), none))
+    rows = moves_of(stand, found_at(stand, stands.stage_moves(12), none))
     for row in rows:
         assert row["against_truth_mm"] < 1e-9
         assert row["against_probe_mm"] == pytest.approx(row["probe_mm"])
@@ -185,7 +171,7 @@ def test_perfect_registrations_have_no_error():
 
 def test_errors_are_told_where_they_are():
     stand = build()
-    stages, turn = stage_turns(12), np.radians(0.1)
+    stages, turn = stands.stage_turns(12), np.radians(0.1)
     axis_part = stand.camera_from_part.inverse().rotation @ stand.camera_from_stage.rotation[:, 2]
     errors = [np.zeros(6)] * 12
     errors[4] = np.concatenate([turn * axis_part, np.zeros(3)])
@@ -198,7 +184,7 @@ def test_errors_are_told_where_they_are():
 
     errors = [np.zeros(6)] * 12
     errors[2] = np.array([turn, 0, 0, 0.3, 0, 0])
-    rows = moves_of(stand, found_at(stand, stage_moves(12), errors))
+    rows = moves_of(stand, found_at(stand, stands.stage_moves(12), errors))
     assert rows[1]["against_truth_mm"] == pytest.approx(0.3, abs=1e-3)
     assert rows[1]["known_frame_mm"] == pytest.approx(0.3, abs=1e-3)
     assert rows[0]["against_truth_mm"] < 1e-9

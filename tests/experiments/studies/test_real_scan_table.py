@@ -10,14 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from experiments.studies.real_scans import study as real_scans
-from experiments.studies.real_scans.study import (
-    KnownScan,
-    load_truth,
-    main,
-    make_parser,
-    summarize,
-    table,
-)
+from experiments.studies.real_scans.study import KnownScan, load_truth, main, make_parser
 from experiments.studies.verdicts.challenge_parts import challenge_parts
 from experiments.studies.verdicts.depth_camera import measure, random_pose
 from vanejax.cad.symmetry import rotation_about
@@ -141,18 +134,18 @@ def test_an_accepted_wrong_pose_is_seen() -> None:
         "verdict": "accepted", "alternatives": 0, "inlier_share": 0.9, "violation_share": None,
         "unmeasured_share": 0.0, "seconds": 1.0,
     }  # fmt: skip
-    fine = summarize([good, good])
-    assert table(fine).splitlines()[-1].startswith("met")
-    wrong = summarize([good, good | {"right": False, "rotation_deg": 175.0}])
+    fine = real_scans.summarize([good, good])
+    assert real_scans.table(fine).splitlines()[-1].startswith("met")
+    wrong = real_scans.summarize([good, good | {"right": False, "rotation_deg": 175.0}])
     assert (wrong["right"], wrong["accepted"], wrong["accepted_wrong"]) == (1, 2, 1)
     assert wrong["mean_of_right"] == {"rotation_deg": 1.0, "translation_mm": 2.0}
-    assert "WRONG" in table(wrong)
-    assert table(wrong).splitlines()[-1].startswith("MISSED")
-    none = summarize([good | {"right": False}])
+    assert "WRONG" in real_scans.table(wrong)
+    assert real_scans.table(wrong).splitlines()[-1].startswith("MISSED")
+    none = real_scans.summarize([good | {"right": False}])
     assert none["mean_of_right"]["rotation_deg"] is None
-    assert "0 of 1 right" in table(none)
-    slow = summarize([good | {"seconds": 30.0}])
-    assert table(slow).splitlines()[-1].startswith("MISSED")
+    assert "0 of 1 right" in real_scans.table(none)
+    slow = real_scans.summarize([good | {"seconds": 30.0}])
+    assert real_scans.table(slow).splitlines()[-1].startswith("MISSED")
 
 
 @pytest.mark.parametrize(

@@ -23,10 +23,10 @@ from experiments.studies.sensor_fit.sensor_statistics import (
 )
 from vanejax.cad.part import part_from_mesh
 from vanejax.errors import InputError
-from vanejax.localization.residuals import RayCasting, measurement_model
-from vanejax.scanner.camera import Camera, field_of_view_deg, look_at
-from vanejax.scanner.measurement import measure
-from vanejax.scanner.sensor import Sensor, consumer_depth
+from vanejax.localization import RayCasting, measurement_model
+from vanejax.scanner import Camera, Sensor, look_at, measure
+from vanejax.scanner.camera import field_of_view_deg
+from vanejax.scanner.sensor import consumer_depth
 
 REAL = Path(__file__).parents[4] / "shared" / "data" / "real_scans"
 GRID = Grid(focal_px=212.3, column_phase=0.21, row_phase=-0.37)

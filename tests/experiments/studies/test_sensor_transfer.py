@@ -12,13 +12,10 @@ import pytest
 
 from experiments.studies.sensor_transfer import study as sensor_transfer
 from experiments.studies.sensor_transfer.study import IDEAL, NO_NETWORK, main, make_parser
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.scanner.camera import hemisphere_viewpoints
-from vanejax.scanner.measurement import measure
-from vanejax.scanner.sensor import preset
-from vanejax.scanner.virtual_scanner import Scanner
-from vanejax.scans.scan_file import save_points
-from vanejax.training.weight_file import find_weights
+from vanejax.cad import guide_vane
+from vanejax.scanner import Scanner, hemisphere_viewpoints, measure, preset
+from vanejax.scans import save_points
+from vanejax.training import find_weights
 
 
 @pytest.fixture(scope="module")
