@@ -26,16 +26,7 @@ from tqdm import tqdm
 from experiments.runner import study_command as study
 from experiments.runner.vane_views import VaneViews, error_row, pose_error
 from experiments.studies.position import report as position_report
-from experiments.studies.position.virtual_test_stand import (
-    VirtualTestStand,
-    calibration_errors,
-    calibrations,
-    frame_bias,
-    place_cubes,
-    pose_bias,
-    stage_moves,
-    stage_turns,
-)
+from experiments.studies.position import virtual_test_stand as virtual
 from vanejax.errors import InputError
 from vanejax.localization.registration import register
 from vanejax.machine import Calibration, MotionErrors, motion_errors, positioning
@@ -68,7 +59,7 @@ class Found:
 
 
 def find(
-    stand: VirtualTestStand,
+    stand: virtual.VirtualTestStand,
     positions: Sequence[RigidTransform],
     first: Found | None,
     *,
@@ -89,8 +80,8 @@ def find(
         result = register(scan, stand.part, init=init, weights=weights, seed=seed)
         seconds = time.perf_counter() - began
         pose = result.part_from_camera
-        bias, covariance = pose_bias(stand, scan, pose, errors), result.uncertainty.covariance
-        status = result.verdict.status
+        bias = virtual.pose_bias(stand, scan, pose, errors)
+        covariance, status = result.uncertainty.covariance, result.verdict.status
         found.append(Found(pose, stand.truth(stage), covariance, bias, status, seconds))
     return found
 
@@ -109,7 +100,7 @@ def covariances(
 
 
 def turn_rows(
-    stand: VirtualTestStand, positions: list[RigidTransform], found: list[Found]
+    stand: virtual.VirtualTestStand, positions: list[RigidTransform], found: list[Found]
 ) -> dict[str, Any]:
     """Every position's turn against the stage's (Fig. 15a).
 
@@ -144,7 +135,7 @@ def turn_rows(
 
 
 def move_rows(
-    stand: VirtualTestStand,
+    stand: virtual.VirtualTestStand,
     positions: list[RigidTransform],
     found: list[Found],
     calibration: Calibration,
@@ -216,7 +207,7 @@ def _length(vector: np.ndarray) -> float:
     return float(np.linalg.norm(vector))
 
 
-def calibration_row(found: Calibration, stand: VirtualTestStand) -> dict[str, float]:
+def calibration_row(found: Calibration, stand: virtual.VirtualTestStand) -> dict[str, float]:
     """How good a calibration is, and how good it says it is."""
     error = pose_error(found.machine_from_camera, stand.machine_from_camera, found.center)
     return error_row(error) | {
@@ -257,15 +248,15 @@ def run_camera(
     rng = np.random.default_rng([seed, _STAND, view])
     kind, center = preset(SENSOR), views.part.center
     camera_from_part = views.viewpoints.view(view)
-    stand = VirtualTestStand.build(views.part, kind.sample(rng), camera_from_part, rng)
-    errors = calibration_errors(kind)
-    turned, moved = stage_turns(positions), stage_moves(positions)
+    stand = virtual.VirtualTestStand.build(views.part, kind.sample(rng), camera_from_part, rng)
+    errors = virtual.calibration_errors(kind)
+    turned, moved = virtual.stage_turns(positions), virtual.stage_moves(positions)
     shared = {"errors": errors, "weights": weights, "seed": seed}
     turns = find(stand, turned, None, salt=2 * view, **shared)
     moves = find(stand, moved, turns[0], salt=2 * view + 1, **shared)
-    placed = place_cubes(stand, np.random.default_rng([seed, _CUBE, view]))
-    joint, mean = calibrations(placed)
-    bias = frame_bias(placed, joint, errors)
+    placed = virtual.place_cubes(stand, np.random.default_rng([seed, _CUBE, view]))
+    joint, mean = virtual.calibrations(placed)
+    bias = virtual.frame_bias(placed, joint, errors)
     machine_from_part = stand.machine_from_camera @ camera_from_part
     return {
         "view": view,
@@ -287,7 +278,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
     chosen = views.select(settings.views)
     if positions < 3:
         raise InputError(f"--positions {positions}: at least 3 are needed for an axis")
-    stage_moves(positions)
+    virtual.stage_moves(positions)
     named = settings.weights
     weights = None if named is None else find_weights(named, views.part)
     method = "ray casting" if weights is None else "RPM-Net, then ray casting"

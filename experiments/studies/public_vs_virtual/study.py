@@ -49,14 +49,8 @@ def public_vs_virtual(
 ) -> dict[str, Any]:
     """Trains both networks where no run is given, and compares them on the part's test views.
 
-    Args:
-      config: recipe, with ``data.shapes`` set.
-      workdir: receives the runs, public_vs_virtual.json and pictures.
-      runs: folders of finished runs, under "public" and "virtual".
-      progress: whether to show progress bars.
-
-    Returns:
-      What public_vs_virtual.json holds.
+    ``workdir`` receives the runs, public_vs_virtual.json, whose content is returned, and pictures;
+    ``runs`` are folders of finished runs, under "public" and "virtual".
 
     Raises:
       InputError: settings, parts or folders that cannot be used.
@@ -101,11 +95,7 @@ def picture(report: Mapping[str, Any], views: str) -> Figure:
     """The paper's Figs 8 and 9 of a record, which holds the errors' means only.
 
     The picture shows the means over views and over axes of errors [V, 3]; the product of both over
-    the mean of all is such errors.
-
-    Args:
-      report: what public_vs_virtual.json holds.
-      views: "hardest" or "all".
+    the mean of all is such errors. ``views`` are "hardest" or "all".
     """
     series = {}
     for source in (VIRTUAL, PUBLIC):

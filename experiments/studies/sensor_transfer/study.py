@@ -159,22 +159,16 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
             networks[name] = network(config, settings.out / config.name)
         model = measurement_model(config.make_part(), np.zeros(3))
         scans = [known for known in truth if known.cad == first.cad]
-        rows[first.cad.stem] = [
-            row
-            for number, known in enumerate(tqdm(scans, first.cad.stem, unit="scan"))
-            for row in register_all(
-                known,
-                model,
-                networks,
-                starts=settings.starts,
-                rng=np.random.default_rng([settings.seed, _STARTS, number]),
-            )
-        ]
+        rows[first.cad.stem] = []
+        for number, known in enumerate(tqdm(scans, first.cad.stem, unit="scan")):
+            rng = np.random.default_rng([settings.seed, _STARTS, number])
+            found = register_all(known, model, networks, starts=settings.starts, rng=rng)
+            rows[first.cad.stem] += found
     names = [IDEAL, settings.sensor, NO_NETWORK]
     together = [row for found in rows.values() for row in found]
+    groups = {"all": together} | rows
     report |= {
-        "summary": {"all": summarize(together, names)}
-        | {part: summarize(found, names) for part, found in rows.items()},
+        "summary": {part: summarize(found, names) for part, found in groups.items()},
         "scans": {
             scan: summarize([row for row in together if row["scan"] == scan], names)
             for scan in dict.fromkeys(row["scan"] for row in together)
