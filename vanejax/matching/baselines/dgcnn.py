@@ -55,10 +55,7 @@ class EdgeLayer(NormedLayer):
 class Dgcnn(nn.Module):
     """Shared MLP over the edges, the maximum over the neighbours after each of its layers.
 
-    Attributes:
-      width: channels of a feature.
-      num_neighbors: K, the point itself counted.
-      edge_widths: channels of the layers over the edges.
+    The ``edge_widths`` are the channels of these layers; see `DcpSettings` for the rest.
     """
 
     width: int = 512
