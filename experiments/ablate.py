@@ -39,10 +39,10 @@ from experiments.runner.trained import trained
 from experiments.studies.ablation import picture as ablation_picture
 from experiments.studies.ablation.table import CELL_TESTS, over_seeds, table
 from experiments.train import load_or_scan
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.files import write_text
-from vanejax.plotting.canvas import save_figure
+from vanejax.plotting import save_figure
 from vanejax.training.dataset import ScanSet, describe_source
 from vanejax.training.train_step import Variables
 
@@ -93,24 +93,15 @@ class SharedScans:
 
 
 def ablate(
-    config: Experiment,
-    sweeps: Sequence[Sweep],
-    seeds: Sequence[int],
-    workdir: Path,
-    *,
-    progress: bool = True,
+    config: Experiment, sweeps: Sequence[Sweep], seeds: Sequence[int], workdir: Path
 ) -> dict[str, Any]:
-    """Trains and tests every cell that is not finished yet, and reports on all.
+    """Trains and tests every cell that is not finished yet; returns what ablation.json holds.
 
     Args:
       config: what the cells change; the test that is the same for all is drawn as it says.
       sweeps: fields and their values; the first is the axis of the picture.
       seeds: every cell is trained with each.
       workdir: receives the cells' runs, cells.jsonl, ablation.json and ablation.png.
-      progress: whether to show progress bars of the tests.
-
-    Returns:
-      What ablation.json holds.
 
     Raises:
       InputError: settings, parts or folders that cannot be used.
@@ -136,7 +127,7 @@ def ablate(
                 f"cell {number} of {len(cells)}, {cell.name}: {'finished' if row else 'training'}"
             )
             if row is None:
-                row = run_cell(cell, config, shared, workdir, progress=progress)
+                row = run_cell(cell, config, shared, workdir)
                 done.append(row)
                 write_text(workdir / "cells.jsonl", "".join(json.dumps(r) + "\n" for r in done))
             rows.append(row)
@@ -155,9 +146,7 @@ def ablate(
     return report
 
 
-def run_cell(
-    cell: Cell, base: Experiment, shared: SharedScans, workdir: Path, *, progress: bool = True
-) -> dict[str, Any]:
+def run_cell(cell: Cell, base: Experiment, shared: SharedScans, workdir: Path) -> dict[str, Any]:
     """Trains a cell and tests it; its line of cells.jsonl.
 
     A training that diverges is a result, too: a line whose tests are None.
@@ -176,19 +165,16 @@ def run_cell(
         training["ended_by"] = "divergence"
     else:
         training = network.record.summary(config.training.steps)
-        tests["own"] = errors_under(config, scans, network.variables, progress=progress)
+        tests["own"] = tests["same"] = errors_under(config, scans, network.variables)
         same = same_test(config, base)
-        tests["same"] = tests["own"]
         if same != config:
-            tests["same"] = errors_under(
-                same, shared.scans(same), network.variables, progress=progress
-            )
+            tests["same"] = errors_under(same, shared.scans(same), network.variables)
     row = {
         "cell": cell.name,
         "overrides": dict(cell.overrides),
         **report_head(part, seed=cell.seed, config=dataclasses.asdict(config)),
         "device": str(jax.devices()[0].device_kind),
-        "training": {name: training[name] for name in training if name != "curve"},
+        "training": training,
         "tests": tests,
     }
     return plain(row)
@@ -203,11 +189,9 @@ def same_test(config: Experiment, base: Experiment) -> Experiment:
     return same
 
 
-def errors_under(
-    config: Experiment, scans: ScanSet, variables: Variables, *, progress: bool = True
-) -> dict[str, Any]:
+def errors_under(config: Experiment, scans: ScanSet, variables: Variables) -> dict[str, Any]:
     """Summaries of the errors over the test views."""
-    report = report_of(config, scans, registered(config, scans, variables, progress=progress))
+    report = report_of(config, scans, registered(config, scans, variables))
     counts = {name: report[name] for name in ("views", "non_finite_views")}
     return counts | {name: report["summary"][name] for name in MEASURES}
 
@@ -232,10 +216,8 @@ def finished(cell: Cell, part: Part, rows: Sequence[dict[str, Any]]) -> dict[str
 
     The rest of its config is the same for all lines: the work folder belongs to one config.
     """
-    for row in rows:
-        if row["cell"] == cell.name and row["part"]["sha256"] == part.sha256:
-            return row
-    return None
+    wanted = cell.name, part.sha256
+    return next((row for row in rows if (row["cell"], row["part"]["sha256"]) == wanted), None)
 
 
 def list_cells(cells: Sequence[Cell], config: Experiment, workdir: Path) -> None:

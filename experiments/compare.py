@@ -37,23 +37,16 @@ from experiments.train import load_or_scan
 from vanejax.errors import InputError, MissingExtra
 from vanejax.files import write_text
 from vanejax.matching.metrics import summary
-from vanejax.training.dataset import ScanSet
-from vanejax.training.pairs import make_bank
+from vanejax.training import ScanSet, make_bank
 
 
-def compare(
-    config: Comparison, workdir: Path, runs: Mapping[str, Path], *, progress: bool = True
-) -> dict[str, Any]:
-    """Trains what is to be trained, registers, refines, and reports.
+def compare(config: Comparison, workdir: Path, runs: Mapping[str, Path]) -> dict[str, Any]:
+    """Trains what is to be trained, registers, refines, and reports what comparison.json holds.
 
     Args:
       config: methods and settings.
       workdir: receives the networks' runs, comparison.json, table.md and pictures.
       runs: folders of trained networks, by name; the others are trained here.
-      progress: whether to show progress bars.
-
-    Returns:
-      What comparison.json holds.
 
     Raises:
       InputError: settings, parts or folders that cannot be used.
@@ -93,12 +86,7 @@ def compare(
             continue
         print(f"{TITLES[name]}: registering")
         results = register_views(
-            register,
-            bank,
-            sampling,
-            seed=experiment.seed,
-            unit_mm=scans.radius_mm,
-            progress=progress,
+            register, bank, sampling, seed=experiment.seed, unit_mm=scans.radius_mm
         )
         report["methods"].append(
             {
@@ -141,21 +129,12 @@ def figures(results: Results, scans: ScanSet) -> dict[str, Any]:
 
 
 def training_summary(network: Trained | None) -> dict[str, Any] | None:
-    """How a network was trained, without its curve; None where there is none."""
+    """How a network was trained; None where there is none."""
     if network is None or network.record is None:
         return None
-    training = network.record.summary(network.config.training.steps)
-    model = network.config.make_network().model
-    leaves = jax.tree.leaves(network.variables)
-    return {
-        "steps": training["steps"],
-        "wanted_steps": training["wanted_steps"],
-        "ended_by": training["ended_by"],
-        "hours": training["hours"],
-        "fall_in_last_quarter": training["fall_in_last_quarter"],
-        "flat": training["flat"],
-        "parameters": sum(leaf.size for leaf in leaves),
-        "model": type(model).__name__,
+    return network.record.summary(network.config.training.steps) | {
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(network.variables)),
+        "model": type(network.config.make_network().model).__name__,
     }
 
 

@@ -10,11 +10,8 @@ from matplotlib.figure import Figure
 
 from experiments.runner import study_command as study
 from vanejax import plotting
-from vanejax.cad.investment_casting import InvestmentCasting, as_cast
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.cad.part import Part
-from vanejax.localization.pose_result import PoseResult
-from vanejax.localization.registration import register
+from vanejax.cad import InvestmentCasting, Part, as_cast, guide_vane
+from vanejax.localization import PoseResult, register
 from vanejax.plotting.canvas import (
     INK,
     PAPER,
@@ -28,16 +25,18 @@ from vanejax.plotting.casting import casting_map
 from vanejax.plotting.matching import Matching, matching_lines
 from vanejax.plotting.segments import segments_picture
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera, Viewpoints, hemisphere_viewpoints
-from vanejax.scanner.clutter import Clutter, clutter_scene
-from vanejax.scanner.measurement import measure
-from vanejax.scanner.sensor import preset
-from vanejax.scanner.virtual_scanner import Scanner
-from vanejax.scans.measured_scan import MeasuredScan, clean_scan
-from vanejax.scans.segmentation import segment
-from vanejax.training.dataset import make_scan_set
-from vanejax.training.pairs import draw_pairs, make_bank
-from vanejax.training.weight_file import TrainedMatcher, find_weights
+from vanejax.scanner import (
+    Camera,
+    Clutter,
+    Scanner,
+    Viewpoints,
+    clutter_scene,
+    hemisphere_viewpoints,
+    measure,
+    preset,
+)
+from vanejax.scans import MeasuredScan, clean_scan, segment
+from vanejax.training import TrainedMatcher, draw_pairs, find_weights, make_bank, make_scan_set
 
 VIEW = 20  # of the 216: elevation 60, azimuth 200 deg, a test view
 SHOWN = (0, 20, 85)  # views whose shadow is drawn

@@ -25,15 +25,13 @@ from experiments.runner.evaluation_report import hardest_views, plain, summarize
 from experiments.runner.experiment import Experiment
 from experiments.runner.machine import report_head
 from experiments.runner.registrations import Results, register_views
-from experiments.runner.run_folder import RunFolder, training_record
-from experiments.runner.training_record import TrainingRecord
-from vanejax.cad.part import Part
+from experiments.runner.run_folder import RunFolder, TrainingRecord, training_record
+from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.files import write_json
-from vanejax.training.checkpoint import Checkpoints
+from vanejax.training import Checkpoints, make_bank
 from vanejax.training.dataset import ScanSet, describe_source, load_scan_set
-from vanejax.training.pairs import make_bank
-from vanejax.training.train_step import Variables, init_state, make_optimizer
+from vanejax.training.train_step import Variables
 
 
 def evaluate(
@@ -44,9 +42,8 @@ def evaluate(
     *,
     part: Part | None = None,
     training: TrainingRecord | None = None,
-    progress: bool = True,
 ) -> dict[str, Any]:
-    """Registers the test views with the network, from the identity, and reports.
+    """Registers the test views from the identity; returns what evaluation.json holds.
 
     Args:
       config: the network, how pairs are drawn, and the seed.
@@ -55,20 +52,17 @@ def evaluate(
       folder: receives evaluation.json and pictures.
       part: where given, pictures that need the CAD part are drawn too.
       training: where given, the report says how long it took, and its curves are drawn.
-      progress: whether to show a progress bar.
-
-    Returns:
-      What evaluation.json holds; numbers that are not finite are None.
 
     Raises:
       InputError: there are no test views.
     """
     test = scans.test
-    results = registered(config, scans, variables, progress=progress)
+    results = registered(config, scans, variables)
     report = report_of(config, scans, results)
-    log = training.rows if training is not None else ()
     if training is not None:
-        report["training"] = plain(training.summary(config.training.steps))
+        summary = training.summary(config.training.steps)
+        report["training"] = plain(summary | {"curve": training.curve})
+    log = training.rows if training is not None else ()
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "evaluation.json", report)
     pictures.draw(results, test, hardest_views(test), log, folder)
@@ -120,11 +114,8 @@ def load_variables(
     Raises:
       InputError: no checkpoint there, or one of another model.
     """
-    model, sampling = config.make_network().model, config.pair_sampling(scans)
     bank = make_bank(scans, num_reference=config.data.num_reference)
-    like = jax.eval_shape(
-        lambda: init_state(model, make_optimizer(config.training), bank, sampling, seed=config.seed)
-    )
+    like = jax.eval_shape(lambda: config.initial_state(bank, config.pair_sampling(scans)))
     path = RunFolder(folder).checkpoints
     if not path.is_dir():
         raise InputError(f"{folder} holds no checkpoints; train first, or give its --workdir")

@@ -21,10 +21,13 @@ from experiments.runner.stopping import Interrupted, stop_signal
 from experiments.runner.training_banks import training_banks
 from experiments.runner.training_log import TrainingLog
 from experiments.runner.validation import make_validation
-from vanejax.cad.part import Part
-from vanejax.training.checkpoint import Checkpoints, restore_or
+from vanejax.cad import Part
+from vanejax.training import (
+    Checkpoints,
+    TrainState,
+    restore_or,
+)
 from vanejax.training.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
-from vanejax.training.train_step import TrainState, init_state, make_optimizer, make_train_step
 
 
 def train(config: Experiment, workdir: Path) -> None:
@@ -62,21 +65,11 @@ def load_or_scan(config: Experiment, part: Part, path: Path) -> ScanSet:
 def fit(config: Experiment, part: Part, scans: ScanSet, folder: RunFolder) -> TrainState:
     """Trains; of ``scans``, only the training views are looked at."""
     training, steps = config.training, config.training.steps
-    network, optimizer = config.make_network(), make_optimizer(training)
     sampling, banks = config.pair_sampling(scans), training_banks(config, part, scans, folder)
-    state = init_state(network.model, optimizer, banks.validation, sampling, seed=config.seed)
+    state = config.initial_state(banks.validation, sampling)
     state = restore_or(folder.checkpoints, state, keep=training.keep)
     validate = make_validation(config, banks.validation, sampling, scans.radius_mm)
-    step = make_train_step(
-        network.model,
-        optimizer,
-        network.loss,
-        sampling,
-        batch_size=training.batch_size,
-        seed=config.seed,
-        average_decay=training.average_decay,
-        quick_compilation=training.quick_compilation,
-    )
+    step = config.train_step(sampling)
     first = int(state.step)
     began = time.monotonic() - folder.seconds  # of all that was trained before, too
     with (

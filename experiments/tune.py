@@ -32,7 +32,7 @@ from experiments.studies.comparison.methods import TITLES, make_method
 from experiments.studies.comparison.settings import CLASSICAL, OPEN3D, Comparison
 from experiments.train import load_or_scan
 from vanejax.errors import InputError, MissingExtra
-from vanejax.training.pairs import make_bank
+from vanejax.training import make_bank
 
 CAP_DEG = 20.0
 _FEATURES = (0.25, 0.3, 0.5)
@@ -90,13 +90,8 @@ def score_deg(results: Results) -> float:
     return float(np.mean(np.minimum(errors, CAP_DEG)))
 
 
-def tune(
-    config: Comparison, workdir: Path, methods: Sequence[str], views: int, *, progress: bool = True
-) -> dict[str, Any]:
-    """Runs the grids on ``views`` training views, spread over all of them.
-
-    Returns:
-      What tuning.json holds.
+def tune(config: Comparison, workdir: Path, methods: Sequence[str], views: int) -> dict[str, Any]:
+    """Runs the grids on ``views`` training views, spread over all; returns what tuning.json holds.
 
     Raises:
       InputError: a method that has no grid, or no training views.
@@ -123,7 +118,7 @@ def tune(
     for name in methods:
         rows = []
         grid = list(cells(GRIDS[name]))
-        for values in tqdm(grid, TITLES[name], unit="cell", disable=not progress):
+        for values in tqdm(grid, TITLES[name], unit="cell"):
             try:
                 register = make_method(name, with_values(config, values))
             except MissingExtra as missing:

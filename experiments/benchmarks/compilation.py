@@ -38,7 +38,7 @@ def compilation(bench: Bench) -> Iterator[Figure]:
 def measure() -> dict[str, float]:
     """Seconds to trace and to compile the step in this process."""
     pairs = VanePairs()
-    step, state, bank = pairs.train_step(), pairs.state(), pairs.bank
+    step, state, bank = pairs.config.train_step(pairs.sampling), pairs.state(), pairs.bank
     began = time.perf_counter()
     lowered = step.lower(state, bank)
     traced = time.perf_counter()

@@ -26,9 +26,12 @@ from experiments.configs.vane import get_config
 from experiments.runner import evaluation_pictures as pictures
 from experiments.runner.evaluation_report import hardest_views, table
 from vanejax import compilation_cache
-from vanejax.training.dataset import ScanSet, load_scan_set, make_scan_set
-from vanejax.training.pairs import make_bank
-from vanejax.training.train_step import init_state, make_optimizer
+from vanejax.training import (
+    ScanSet,
+    load_scan_set,
+    make_bank,
+    make_scan_set,
+)
 
 
 def evaluation(bench: Bench) -> Iterator[Figure]:
@@ -76,10 +79,7 @@ def measure(scans: ScanSet) -> dict[str, float]:
     """Seconds in this process: of the figures, of the registrations alone, of the pictures."""
     config = get_config()
     bank = make_bank(scans, num_reference=config.data.num_reference)
-    sampling = config.pair_sampling(scans)
-    variables = init_state(
-        config.make_network().model, make_optimizer(config.training), bank, sampling, seed=0
-    ).variables
+    variables = config.initial_state(bank, config.pair_sampling(scans)).variables
     part = config.make_part()
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         began = time.perf_counter()

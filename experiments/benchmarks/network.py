@@ -79,7 +79,7 @@ def sizes(pairs: VanePairs) -> str:
 
 def training(pairs: VanePairs) -> Callable[[], float]:
     """Steps of one training run, each of which gives its loss."""
-    train_step, state = pairs.train_step(), pairs.state()
+    train_step, state = pairs.config.train_step(pairs.sampling), pairs.state()
 
     def step() -> float:
         nonlocal state

@@ -12,9 +12,12 @@ from experiments.configs.vane import get_config
 from experiments.runner.experiment import Experiment
 from vanejax.cad import guide_vane
 from vanejax.scanner import Camera, hemisphere_viewpoints
-from vanejax.training import ScanSet, make_scan_set
+from vanejax.training import (
+    ScanSet,
+    TrainState,
+    make_scan_set,
+)
 from vanejax.training.pairs import Pair, PairSampling, ScanBank, draw_pairs, make_bank
-from vanejax.training.train_step import TrainState, init_state, make_optimizer, make_train_step
 
 ELEVATIONS_DEG, AZIMUTHS_DEG = (70.0,), (10.0, 100.0, 190.0, 280.0)
 
@@ -66,18 +69,4 @@ class VanePairs:
 
     def state(self) -> TrainState:
         """Untrained."""
-        model, optimizer = self.config.make_network().model, make_optimizer(self.config.training)
-        return init_state(model, optimizer, self.bank, self.sampling, seed=0)
-
-    def train_step(self):
-        """The jitted step of training: ``state, metrics = step(state, bank)``."""
-        return make_train_step(
-            self.config.make_network().model,
-            make_optimizer(self.config.training),
-            self.config.make_network().loss,
-            self.sampling,
-            batch_size=self.batch,
-            seed=0,
-            average_decay=self.config.training.average_decay,
-            quick_compilation=self.config.training.quick_compilation,
-        )
+        return self.config.initial_state(self.bank, self.sampling)

@@ -10,10 +10,9 @@ import numpy as np
 from experiments.runner.experiment import Experiment
 from experiments.runner.registrations import Results
 from vanejax import plotting
-from vanejax.cad.part import Part
-from vanejax.scanner.camera import hemisphere_viewpoints
-from vanejax.scanner.virtual_scanner import Scanner
-from vanejax.training.dataset import ScanSet
+from vanejax.cad import Part
+from vanejax.scanner import Scanner, hemisphere_viewpoints
+from vanejax.training import ScanSet
 
 PORTRAIT_PIXELS = 2.0  # times the camera's per side: the picture is printed larger than a scan
 SURFACE_SAMPLES = 100_000  # so dense that hidden surface looks as solid as seen one

@@ -9,7 +9,7 @@ import numpy as np
 
 from experiments.runner.registrations import Results
 from vanejax.matching.metrics import mean_per_axis, mean_per_view, summary
-from vanejax.training.dataset import ScanSet
+from vanejax.training import ScanSet
 
 MEASURES = {
     "rotation_error_deg": "rotation error (deg)",
@@ -122,12 +122,14 @@ def _cell(value: float | None) -> str:
     return f"{'-':>10}" if value is None else f"{value:>10.4f}"
 
 
-def plain(value: Any) -> Any:
-    """Numbers, lists and dicts that strict JSON can hold: no arrays, None where not finite."""
+def plain(value: Any, digits: int = 17) -> Any:
+    """What strict JSON can hold: no arrays, None where not finite, so many significant digits."""
     if isinstance(value, dict):
-        return {name: plain(entry) for name, entry in value.items()}
+        return {name: plain(entry, digits) for name, entry in value.items()}
     if isinstance(value, jax.Array | np.ndarray | np.generic):
-        return plain(np.asarray(value).tolist())
+        return plain(np.asarray(value).tolist(), digits)
     if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+        return [plain(entry, digits) for entry in value]
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}") if np.isfinite(value) else None
+    return value

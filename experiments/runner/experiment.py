@@ -6,12 +6,12 @@ Every field can be overridden on the command line: ``--config.model.num_neighbor
 from __future__ import annotations
 
 import difflib
+from collections.abc import Callable
 from dataclasses import field
 
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.cad.part import Part, load_part
+from vanejax.cad import Part, guide_vane, load_part
 from vanejax.errors import InputError
-from vanejax.scanner.camera import Camera, Viewpoints, hemisphere_viewpoints
+from vanejax.scanner import Camera, Viewpoints, hemisphere_viewpoints
 from vanejax.settings import (
     Settings,
     bounded,
@@ -20,7 +20,16 @@ from vanejax.settings import (
     positive,
     settings_class,
 )
-from vanejax.training.dataset import ScanSet
+from vanejax.training import (
+    OptimizerSettings,
+    PairSampling,
+    RpmNetLoss,
+    ScanSet,
+    TrainState,
+    init_state,
+    make_optimizer,
+    make_train_step,
+)
 from vanejax.training.networks import (
     DcpNetwork,
     Network,
@@ -29,9 +38,16 @@ from vanejax.training.networks import (
     RpmNetNetwork,
 )
 from vanejax.training.online_scans import OnlineScans
-from vanejax.training.pairs import PairSampling
-from vanejax.training.rpmnet_loss import RpmNetLoss
-from vanejax.training.train_step import OptimizerSettings
+from vanejax.training.pairs import Bank
+from vanejax.training.train_step import Metrics
+
+# by the name of a network: the groups of settings that it uses
+NETWORKS = {
+    "rpmnet": ("model", "loss"),
+    "dcp": ("dcp",),
+    "pointnetlk": ("pointnetlk",),
+    "pcrnet": ("pcrnet",),
+}
 
 
 @settings_class
@@ -179,6 +195,27 @@ class Experiment(Settings):
             return self.model.make(self.loss)
         return getattr(self, self.model.name).make()
 
+    def initial_state(self, bank: Bank, sampling: PairSampling) -> TrainState:
+        """The network and its optimizer before the first step."""
+        model, optimizer = self.make_network().model, make_optimizer(self.training)
+        return init_state(model, optimizer, bank, sampling, seed=self.seed)
+
+    def train_step(
+        self, sampling: PairSampling
+    ) -> Callable[[TrainState, Bank], tuple[TrainState, Metrics]]:
+        """The jitted step of training: ``state, metrics = step(state, bank)``."""
+        network, training = self.make_network(), self.training
+        return make_train_step(
+            network.model,
+            make_optimizer(training),
+            network.loss,
+            sampling,
+            batch_size=training.batch_size,
+            seed=self.seed,
+            average_decay=training.average_decay,
+            quick_compilation=training.quick_compilation,
+        )
+
     def groups_of_network(self) -> tuple[str, ...]:
         """The groups of settings that the network of ``model.name`` uses.
 
@@ -186,16 +223,14 @@ class Experiment(Settings):
           InputError: there is no network of this name.
         """
         name = self.model.name
-        networks = {other: (other,) for other in ("dcp", "pointnetlk", "pcrnet")}
-        networks = {"rpmnet": ("model", "loss")} | networks
-        if name not in networks:
-            near = difflib.get_close_matches(name, networks, 1)
+        if name not in NETWORKS:
+            near = difflib.get_close_matches(name, NETWORKS, 1)
             hint = f"; did you mean {near[0]}?" if near else ""
             raise InputError(
                 f"config.model.name={name!r}: there is no such network{hint} "
-                f"(the names are {', '.join(networks)})"
+                f"(the names are {', '.join(NETWORKS)})"
             )
-        return networks[name]
+        return NETWORKS[name]
 
     def check_used(self, path: str) -> None:
         """Refuses a field, such as ``model.num_neighbors``, of a network that is not trained.
@@ -204,7 +239,7 @@ class Experiment(Settings):
           InputError: names the fields that the network does use.
         """
         used = self.groups_of_network()
-        others = {"model", "loss", "dcp", "pointnetlk", "pcrnet"} - set(used)
+        others = {group for groups in NETWORKS.values() for group in groups} - set(used)
         if path != "model.name" and path.partition(".")[0] in others:
             fields = [f for group in used for f in field_paths(getattr(self, group), group)]
             raise InputError(

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 
 MATMUL_SIZE = 2048
 PACKAGES = ("vanejax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "embreex")

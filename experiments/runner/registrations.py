@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from vanejax.matching.contract import Register, Registration
+from vanejax.matching import Register, Registration
 from vanejax.matching.metrics import PoseErrors, SurfaceFit, pose_errors, surface_fit
 from vanejax.rigid import RigidTransform
 from vanejax.training.pairs import Pair, PairSampling, ScanBank, draw_source, draw_target

@@ -7,19 +7,22 @@ import fcntl
 import json
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments.runner.experiment import Experiment
 from experiments.runner.machine import git_commit, timestamp, versions
-from experiments.runner.training_record import TrainingRecord
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.files import read_json, write_json, write_text
 from vanejax.settings import values_of, with_defaults
 
 CLOCK = "clock.json"
+VALIDATION = ("validation_rotation_error_deg", "validation_translation_error_mm")
+FLAT = 0.1  # a curve is flat where the last quarter of the steps lowers the error by less
 
 
 class RunFolder:
@@ -163,6 +166,43 @@ def read_log(folder: str | os.PathLike[str]) -> list[dict[str, float]]:
         if isinstance(row, dict) and isinstance(row.get("step"), int):
             rows.append(row)
     return rows
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingRecord:
+    """How long a run was trained: the rows of its log, and the seconds over all resumptions."""
+
+    rows: Sequence[Mapping[str, float]]
+    seconds: float
+
+    @property
+    def curve(self) -> list[dict[str, float]]:
+        """Step and validation errors."""
+        names = ("step", *VALIDATION)
+        return [{name: row[name] for name in names} for row in self.rows if VALIDATION[0] in row]
+
+    def summary(self, wanted_steps: int) -> dict[str, Any]:
+        """For a report on a run that should have had ``wanted_steps``: would more have helped?
+
+        ``ended_by`` is "budget" where fewer steps were done. ``fall_in_last_quarter`` is of the
+        validation's rotation error: its mean over the last quarter of the steps against that over
+        the third; NaN where too few were validated.
+        """
+        steps = int(self.rows[-1]["step"]) if self.rows else 0
+
+        def mean_error(first: float, last: float) -> float:
+            within = [row for row in self.curve if first * steps < row["step"] <= last * steps]
+            return float(np.mean([row[VALIDATION[0]] for row in within])) if within else np.nan
+
+        fall = 1.0 - mean_error(0.75, 1.0) / mean_error(0.5, 0.75)
+        return {
+            "steps": steps,
+            "wanted_steps": wanted_steps,
+            "ended_by": "budget" if steps < wanted_steps else "steps",
+            "hours": self.seconds / 3600,
+            "fall_in_last_quarter": fall,
+            "flat": bool(fall < FLAT),
+        }
 
 
 def training_record(folder: str | os.PathLike[str]) -> TrainingRecord:

@@ -13,9 +13,11 @@ from experiments.runner.evaluation_report import plain
 from experiments.runner.machine import report_head
 from experiments.runner.stopping import exit_code
 from vanejax import compilation_cache
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.files import write_json
+
+DIGITS = 6  # significant ones: more of a measured figure is noise
 
 
 def make_parser(name: str, description: str | None) -> argparse.ArgumentParser:
@@ -54,24 +56,13 @@ def save(folder: Path, name: str, report: dict[str, Any]) -> dict[str, Any]:
     Raises:
       InputError: the folder cannot be written.
     """
-    report = _rounded(plain(report))
+    report = plain(report, DIGITS)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / f"{name}.json", report)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
     return report
-
-
-def _rounded(value: Any) -> Any:
-    """The same with six significant digits: more of a measured figure is noise."""
-    if isinstance(value, float):
-        return float(f"{value:.6g}")
-    if isinstance(value, dict):
-        return {name: _rounded(entry) for name, entry in value.items()}
-    if isinstance(value, list):
-        return [_rounded(entry) for entry in value]
-    return value
 
 
 def positive_numbers(text: str) -> tuple[float, ...]:

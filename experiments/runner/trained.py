@@ -9,14 +9,19 @@ from pathlib import Path
 
 from experiments.evaluate import load_variables
 from experiments.runner.experiment import Experiment
-from experiments.runner.run_folder import RunFolder, differences, read_record, training_record
-from experiments.runner.training_record import TrainingRecord
+from experiments.runner.run_folder import (
+    RunFolder,
+    TrainingRecord,
+    differences,
+    read_record,
+    training_record,
+)
 from experiments.train import fit
-from vanejax.cad.part import Part
+from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.matching.torch_weights import load_state_dict, rpmnet_variables
 from vanejax.settings import values_of
-from vanejax.training.dataset import ScanSet
+from vanejax.training import ScanSet
 from vanejax.training.train_step import Variables
 
 

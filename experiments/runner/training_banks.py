@@ -11,9 +11,8 @@ import jax.numpy as jnp
 
 from experiments.runner.experiment import Experiment
 from experiments.runner.run_folder import RunFolder
-from vanejax.cad.part import Part
-from vanejax.training.dataset import ScanSet
-from vanejax.training.pairs import make_bank
+from vanejax.cad import Part
+from vanejax.training import ScanSet, make_bank
 from vanejax.training.shape_pairs import ShapeBank
 from vanejax.training.shape_sets import load_shapes
 from vanejax.training.train_step import Bank

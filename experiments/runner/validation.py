@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.runner.experiment import Experiment
-from vanejax.matching.metrics import pose_metrics
+from vanejax.matching import pose_metrics
 from vanejax.rigid import RigidTransform
 from vanejax.training.pairs import PairSampling
 from vanejax.training.train_step import Bank, Metrics, TrainState, Variables

@@ -8,13 +8,12 @@ import functools
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.cad.part import Part
+from vanejax.cad import Part, guide_vane
 from vanejax.errors import InputError
 from vanejax.localization.pose_batch import stack
 from vanejax.localization.residuals import RayCasting, measurement_model, moved
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.camera import Camera, Viewpoints, hemisphere_viewpoints
+from vanejax.scanner import Camera, Viewpoints, hemisphere_viewpoints
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

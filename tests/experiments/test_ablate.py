@@ -14,11 +14,10 @@ from example_experiment import tiny_experiment
 from experiments import ablate
 from experiments.configs.smoke import get_config
 from experiments.runner.experiment import Experiment
-from experiments.runner.run_folder import RunFolder
+from experiments.runner.run_folder import RunFolder, TrainingRecord
 from experiments.runner.stopping import Interrupted, TrainingDiverged, exit_code
 from experiments.runner.sweep import Cell, Sweep, grid
 from experiments.runner.trained import Trained
-from experiments.runner.training_record import TrainingRecord
 from experiments.studies.ablation import picture as ablation_picture
 from experiments.studies.ablation.table import over_seeds, table
 from vanejax.errors import InputError
@@ -50,7 +49,7 @@ class Mock:
             raise trouble
         return Trained({}, config, TrainingRecord(({"step": self.steps},), seconds=360.0))
 
-    def test(self, config, scans, variables, *, progress) -> dict:
+    def test(self, config, scans, variables) -> dict:
         self.tested.append(config)
         error = 1.0 + config.data.noise + 0.1 * config.seed + 1 / config.model.num_neighbors
         figures = {"mean": error, "median": error, "p95": 2 * error, "max": 3 * error}

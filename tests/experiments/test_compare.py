@@ -45,7 +45,7 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def report(folder: Path, hasty_compiler) -> dict:
-    return compare(small(), folder, {}, progress=False)
+    return compare(small(), folder, {})
 
 
 def test_every_method_is_compared_alone_and_refined(report: dict, folder: Path) -> None:
@@ -89,7 +89,7 @@ def test_a_finished_run_is_taken_instead_of_training(report: dict, folder: Path)
     config.methods = ("pcrnet",)
     config.training.pcrnet.steps = 99  # of a training that is not done here
     other = folder / "other"
-    (again,) = compare(config, other, {"pcrnet": folder / "pcrnet"}, progress=False)["methods"]
+    (again,) = compare(config, other, {"pcrnet": folder / "pcrnet"})["methods"]
     assert not (other / "pcrnet").exists()
     alone = report["methods"][1]["alone"]
     assert again["alone"]["rotation_error_deg"] == alone["rotation_error_deg"]
@@ -139,14 +139,14 @@ def test_a_missing_peer_is_a_line_and_no_failure(monkeypatch, tmp_path: Path) ->
     monkeypatch.setattr(command, "make_method", missing)
     config = small()
     config.methods = ("open3d_icp",)
-    report = compare(config, tmp_path, {}, progress=False)
+    report = compare(config, tmp_path, {})
     assert report["methods"][0]["skipped"] == "needs the extra peers"
     assert "needs the extra peers" in table(report)
     config.open3d_icp.trim = 0.5  # what the method cannot do is no missing package
     monkeypatch.undo()
     pytest.importorskip("open3d", reason="needs the extra peers")
     with pytest.raises(InputError, match="does not trim"):
-        compare(config, tmp_path, {}, progress=False)
+        compare(config, tmp_path, {})
 
 
 def test_the_config_of_table_1_has_all_methods_with_their_settings() -> None:

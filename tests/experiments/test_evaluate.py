@@ -16,13 +16,13 @@ from experiments.evaluate import evaluate
 from experiments.runner.evaluation_report import hardest_views, plain, summarize, table
 from experiments.runner.experiment import Experiment
 from experiments.runner.registrations import Results, register_views
-from experiments.runner.training_record import TrainingRecord
+from experiments.runner.run_folder import TrainingRecord
 from vanejax.errors import InputError
-from vanejax.matching.contract import Registration
+from vanejax.matching import Registration
 from vanejax.matching.se3 import rotation_angle
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
-from vanejax.training.dataset import ScanSet, make_scan_set
+from vanejax.training import ScanSet, make_scan_set
 from vanejax.training.pairs import ScanBank, draw_source, make_bank
 
 pytestmark = pytest.mark.usefixtures("hasty_compiler")
@@ -170,7 +170,6 @@ def test_evaluate_writes_json_and_pictures(
         tmp_path,
         part=part,
         training=TrainingRecord(rows, 36.0),
-        progress=False,
     )
 
     def refuse(constant: str) -> float:

@@ -15,8 +15,7 @@ from experiments.studies.comparison.methods import GROUPS
 from experiments.studies.comparison.settings import Comparison
 from experiments.tune import CAP_DEG, GRIDS, cells, score_deg, tune, with_values
 from vanejax.errors import InputError
-from vanejax.training.dataset import load_scan_set
-from vanejax.training.pairs import make_bank
+from vanejax.training import load_scan_set, make_bank
 
 
 def small() -> Comparison:
@@ -60,7 +59,7 @@ def test_the_best_cell_wins_on_training_views_alone(monkeypatch, tmp_path: Path,
     monkeypatch.setattr(command, "make_method", lambda name, config: config)
     monkeypatch.setattr(command, "with_values", lambda config, values: values)
     monkeypatch.setattr(command, "GRIDS", {"icp": {"icp.max_distance": (3.0, 1.0, 2.0)}})
-    report = tune(small(), tmp_path, ["icp"], 3, progress=False)
+    report = tune(small(), tmp_path, ["icp"], 3)
     found = report["methods"]["icp"]
     assert found["best"]["values"] == {"icp.max_distance": 1.0}
     assert found["best"]["score_deg"] == 1.5
@@ -83,7 +82,7 @@ def test_no_pair_is_drawn_from_a_test_view(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setattr(command, "register_views", register_views)
     monkeypatch.setattr(command, "GRIDS", {"icp": {"icp.max_distance": (1.0,)}})
     config = small()
-    tune(config, tmp_path, ["icp"], 99, progress=False)
+    tune(config, tmp_path, ["icp"], 99)
     scans = load_scan_set(tmp_path / "scans.npz")
     (bank,) = banks
     wanted = make_bank(scans.train, num_reference=config.experiment.data.num_reference)

@@ -85,6 +85,7 @@ class Claim:
 class Topic:
     """A section of the report: its heading, and its claims, all of the paper or all goals."""
 
+    name: str
     title: str
     claims: Sequence[Claim]
 

@@ -18,20 +18,7 @@ from matplotlib.figure import Figure
 
 from experiments.pages.blocks import BLOCKS, GROUPS, block
 from experiments.pages.reproduction.claim import Results, Topic, Verdict
-from experiments.pages.reproduction.claims.networks import (
-    ABLATIONS,
-    METHODS,
-    PUBLIC_SHAPES,
-    VIEWS,
-)
-from experiments.pages.reproduction.claims.poses import ANY_POSE, BOUND, POSITION, SPEED, VERDICT
-from experiments.pages.reproduction.claims.scans import (
-    CLUTTER,
-    DENSITY,
-    REAL_SCANS,
-    SCANNER,
-    SENSING,
-)
+from experiments.pages.reproduction.claims import networks, poses, scans
 from experiments.pages.reproduction.live import Live, against_evaluation, against_position
 from experiments.pages.reproduction.studies import BY_RECORD, Outcome
 from experiments.runner.markdown import folded, machine_of, provenance, slug, table
@@ -49,22 +36,7 @@ PAPER = (
     "“Simulation of Self-Occlusion Virtual Dataset Method for Robust Point Matching Algorithm, "
     "With Applications to Positioning of Guide Vanes”"
 )
-TOPICS = {
-    "scanner": SCANNER,
-    "density": DENSITY,
-    "methods": METHODS,
-    "views": VIEWS,
-    "public shapes": PUBLIC_SHAPES,
-    "ablations": ABLATIONS,
-    "sensing": SENSING,
-    "position": POSITION,
-    "bound": BOUND,
-    "verdict": VERDICT,
-    "any pose": ANY_POSE,
-    "real scans": REAL_SCANS,
-    "clutter": CLUTTER,
-    "speed": SPEED,
-}
+TOPICS = {topic.name: topic for topic in (*scans.TOPICS, *networks.TOPICS, *poses.TOPICS)}
 # by record, and by what of it where there are several: the picture that is drawn
 PICTURES: dict[str, Callable[[Any], Figure]] = {
     "density": lambda report: density_report.picture(report["sweeps"]),

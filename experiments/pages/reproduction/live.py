@@ -44,12 +44,7 @@ class Live:
 
 
 def evaluate_live(
-    matcher: TrainedMatcher,
-    weights: str,
-    out: Path,
-    *,
-    config: Experiment | None = None,
-    progress: bool = True,
+    matcher: TrainedMatcher, weights: str, out: Path, *, config: Experiment | None = None
 ) -> Live:
     """Scans the test views anew and registers them, as `experiments.evaluate` does.
 
@@ -58,7 +53,6 @@ def evaluate_live(
       weights: where it is from, for the reader.
       out: evaluation.json and pictures go to its folder vane.
       config: the recipe, `vane.py` if not given; its views and points.
-      progress: whether to show progress bars.
 
     Raises:
       InputError: weights for another part, or of a network that `config` does not describe.
@@ -71,7 +65,7 @@ def evaluate_live(
     folder.mkdir(parents=True, exist_ok=True)
     scans = load_or_scan(config, part, folder / "scans.npz")
     check_recipe(matcher, config)
-    report = evaluate(config, scans, matcher.variables, folder, part=part, progress=progress)
+    report = evaluate(config, scans, matcher.variables, folder, part=part)
     seconds = time.perf_counter() - began
     return Live(report, weights, matcher.trained.get("commit"), seconds)
 

@@ -77,13 +77,13 @@ def test_weights_of_another_recipe_are_refused() -> None:
 def test_the_live_evaluation_scans_anew_with_the_weights_given(tmp_path, monkeypatch) -> None:
     asked = {}
 
-    def evaluate(config, scans, variables, folder, *, part, progress):
+    def evaluate(config, scans, variables, folder, *, part):
         asked.update(scans=scans, variables=variables, folder=folder)
         return {"views": len(scans.test)}
 
     monkeypatch.setattr(live_module, "evaluate", evaluate)
     config = smoke.get_config()
-    live = evaluate_live(matcher_of(config), "w.npz", tmp_path, config=config, progress=False)
+    live = evaluate_live(matcher_of(config), "w.npz", tmp_path, config=config)
     assert asked["variables"] == "weights"
     assert asked["folder"] == tmp_path / "vane"
     assert live.report["views"] == len(asked["scans"].test) > 0

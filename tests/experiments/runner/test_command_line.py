@@ -18,8 +18,7 @@ from experiments.runner.experiment import Experiment
 from vanejax.errors import InputError
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
-from vanejax.training.pairs import Pair
-from vanejax.training.rpmnet_loss import RpmNetLoss
+from vanejax.training import Pair, RpmNetLoss
 
 ROOT = Path(__file__).parents[3]
 

@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from experiments.runner.run_folder import RunFolder, training_record
-from experiments.runner.training_record import VALIDATION, TrainingRecord
+from experiments.runner.run_folder import VALIDATION, RunFolder, TrainingRecord, training_record
 from vanejax.errors import InputError
 from vanejax.files import write_text
 
@@ -22,13 +21,14 @@ def rows(errors_deg: list[float]) -> list[dict[str, float]]:
 
 
 def test_the_fall_compares_the_last_quarter_with_the_third() -> None:
-    told = TrainingRecord(rows([9, 9, 8, 8, 4, 4, 2, 2]), 7200.0).summary(80)
+    record = TrainingRecord(rows([9, 9, 8, 8, 4, 4, 2, 2]), 7200.0)
+    told = record.summary(80)
     assert told["steps"] == told["wanted_steps"] == 80
     assert told["ended_by"] == "steps"
     assert told["hours"] == 2
     assert told["fall_in_last_quarter"] == pytest.approx(0.5)
     assert not told["flat"]
-    assert [point["step"] for point in told["curve"]] == list(range(10, 90, 10))
+    assert [point["step"] for point in record.curve] == list(range(10, 90, 10))
     flat = TrainingRecord(rows([9, 9, 8, 8, 4, 4, 3.9, 3.9]), 1.0).summary(80)
     assert flat["flat"]
 

@@ -91,11 +91,6 @@ def _time(comparison: Report) -> Finding:
     )
 
 
-METHODS = Topic(
-    "Every method: Table 1 and Fig. 3",
-    (_best, *_METRICS, _time),
-)
-
 # ---- the test views
 
 
@@ -118,8 +113,6 @@ def _overlays(report: Report) -> Finding:
         "true pose.",
     )
 
-
-VIEWS = Topic("The test views: Fig. 7", (_overlays,))
 
 # ---- what a network is trained on, and with what
 
@@ -164,12 +157,6 @@ def _stability(report: Report) -> Finding:
     )
 
 
-PUBLIC_SHAPES = Topic(
-    "Public shapes against virtual scans: Figs 8 and 9",
-    (_reduction, _stability),
-)
-
-
 @claim(
     "k = 32 neighbours train best",
     f"{PAPER_NEIGHBORS}",
@@ -195,4 +182,17 @@ def _neighbors(report: Report) -> Finding:
     )
 
 
-ABLATIONS = Topic("Ablations: k and noise", (_neighbors,))
+TOPICS = (
+    Topic(
+        "methods",
+        "Every method: Table 1 and Fig. 3",
+        (_best, *_METRICS, _time),
+    ),
+    Topic("views", "The test views: Fig. 7", (_overlays,)),
+    Topic(
+        "public shapes",
+        "Public shapes against virtual scans: Figs 8 and 9",
+        (_reduction, _stability),
+    ),
+    Topic("ablations", "Ablations: k and noise", (_neighbors,)),
+)
