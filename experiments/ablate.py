@@ -72,8 +72,7 @@ class SharedScans:
     def path(self, config: Experiment) -> Path:
         """Where the scans of a cell are: the same file where they are the same scans.
 
-        Raises:
-          InputError: viewpoints that cannot be made, or none to train on or to test.
+        Raises InputError where viewpoints to train on or to test are lacking.
         """
         part = self.part(config)
         viewpoints = config.make_viewpoints(part)
@@ -97,15 +96,9 @@ def ablate(
 ) -> dict[str, Any]:
     """Trains and tests every cell that is not finished yet; returns what ablation.json holds.
 
-    Args:
-      config: what the cells change; the test that is the same for all is drawn as it says.
-      sweeps: fields and their values; the first is the axis of the picture.
-      seeds: every cell is trained with each.
-      workdir: receives the cells' runs, cells.jsonl, ablation.json and ablation.png.
-
-    Raises:
-      InputError: settings, parts or folders that cannot be used.
-      Interrupted: SIGINT or SIGTERM, after the state of the cell was saved.
+    The test that is the same for all cells is drawn as ``config`` says; the first of the ``sweeps``
+    is the axis of the picture. Raises InputError before anything is trained, and Interrupted after
+    the state of a cell was saved.
     """
     cells = grid(sweeps, seeds)
     check_used(cells, config)
@@ -147,12 +140,9 @@ def ablate(
 
 
 def run_cell(cell: Cell, base: Experiment, shared: SharedScans, workdir: Path) -> dict[str, Any]:
-    """Trains a cell and tests it; its line of cells.jsonl.
+    """Trains a cell, or goes on from its checkpoint, and tests it; its line of cells.jsonl.
 
     A training that diverges is a result, too: a line whose tests are None.
-
-    Raises:
-      Interrupted: SIGINT or SIGTERM; the cell goes on from its checkpoint.
     """
     config, folder = cell.config(base), workdir / "cells" / cell.name
     part, scans = shared.part(config), shared.scans(config)
@@ -197,11 +187,7 @@ def errors_under(config: Experiment, scans: ScanSet, variables: Variables) -> di
 
 
 def read_cells(workdir: Path) -> list[dict[str, Any]]:
-    """The lines of cells.jsonl; none where there is no such file.
-
-    Raises:
-      InputError: a line that cannot be read.
-    """
+    """The lines of cells.jsonl, none where there is no such file; InputError for broken ones."""
     path = workdir / "cells.jsonl"
     if not path.exists():
         return []
@@ -212,10 +198,7 @@ def read_cells(workdir: Path) -> list[dict[str, Any]]:
 
 
 def finished(cell: Cell, part: Part, rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """The line of this very cell on this very part; None if there is none.
-
-    The rest of its config is the same for all lines: the work folder belongs to one config.
-    """
+    """The line of this very cell on this very part; a work folder belongs to one config."""
     wanted = cell.name, part.sha256
     return next((row for row in rows if (row["cell"], row["part"]["sha256"]) == wanted), None)
 

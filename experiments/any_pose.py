@@ -1,7 +1,4 @@
-"""The guide vane from uniformly random rotations, without an initial guess.
-
-See `experiments.studies.any_pose`.
-"""
+"""The guide vane from uniformly random rotations, without an initial guess."""
 
 from experiments.runner import study_command
 from experiments.studies.any_pose.study import main, make_parser

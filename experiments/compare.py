@@ -43,14 +43,9 @@ from vanejax.training import ScanSet, make_bank
 def compare(config: Comparison, workdir: Path, runs: Mapping[str, Path]) -> dict[str, Any]:
     """Trains what is to be trained, registers, refines, and reports what comparison.json holds.
 
-    Args:
-      config: methods and settings.
-      workdir: receives the networks' runs, comparison.json, table.md and pictures.
-      runs: folders of trained networks, by name; the others are trained here.
-
-    Raises:
-      InputError: settings, parts or folders that cannot be used.
-      TrainingDiverged, Interrupted: as `experiments.train.fit`.
+    ``workdir`` receives the networks' runs, comparison.json, table.md and pictures; ``runs`` are
+    the folders of networks that are trained already, by name. Errors as of `experiments.train.fit`,
+    and InputError for settings, parts or folders that cannot be used.
     """
     config.check()
     experiment = config.experiment

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.runner import study_command as study
+from experiments.runner.evaluation_pictures import SURFACE_SAMPLES, shadow_picture
 from vanejax import plotting
 from vanejax.cad import InvestmentCasting, Part, as_cast, guide_vane
 from vanejax.localization import PoseResult, register
@@ -72,15 +73,6 @@ def viewpoints_picture(sphere: Viewpoints, printed: Viewpoints, center: np.ndarr
     return figure
 
 
-def shadow_picture(scanner: Scanner, views: Viewpoints) -> Figure:
-    """What three views see and what the part hides from them: the paper's Fig. 5."""
-    scans = [scanner.scan(Camera(), views.view(view), hidden=True) for view in SHOWN]
-    names = [
-        plotting.view_name(views.elevation_deg[view], views.azimuth_deg[view]) for view in SHOWN
-    ]
-    return plotting.view_and_shadow(scans, names)
-
-
 def registered(scanner: Scanner, views: Viewpoints, seed: int) -> tuple[PoseResult, MeasuredScan]:
     """One scan by the paper's camera, registered from no guess."""
     rng = np.random.default_rng(seed)
@@ -123,14 +115,14 @@ def matching_picture(matcher: TrainedMatcher, part: Part, views: Viewpoints, see
 def main(settings: argparse.Namespace) -> None:
     """Draws them all."""
     part = guide_vane()
-    scanner = Scanner(part, surface_samples=100_000)
+    scanner = Scanner(part, surface_samples=SURFACE_SAMPLES)
     sphere = hemisphere_viewpoints(part.center)
     printed = hemisphere_viewpoints(part.center, formula="printed")
     result, scan = registered(scanner, sphere, settings.seed)
     cast = as_cast(part, InvestmentCasting(allowance_mm=0.5), np.random.default_rng(settings.seed))
     figures = {
         "how_viewpoints": viewpoints_picture(sphere, printed, part.center),
-        "how_shadow": shadow_picture(scanner, sphere),
+        "how_shadow": shadow_picture(scanner, Camera(), sphere, SHOWN)[0],
         "how_scene": scene_picture(sphere, settings.seed),
         "how_casting": casting_map(part, cast),
         "how_matching": matching_picture(

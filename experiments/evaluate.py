@@ -45,16 +45,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Registers the test views from the identity; returns what evaluation.json holds.
 
-    Args:
-      config: the network, how pairs are drawn, and the seed.
-      scans: all views; those with `Viewpoints.is_test` are registered.
-      variables: trained weights.
-      folder: receives evaluation.json and pictures.
-      part: where given, pictures that need the CAD part are drawn too.
-      training: where given, the report says how long it took, and its curves are drawn.
-
-    Raises:
-      InputError: there are no test views.
+    With the CAD ``part``, the pictures that need it are drawn too; with the ``training``, the
+    report says how long it took, and its curves are drawn. Raises InputError without test views.
     """
     test = scans.test
     results = registered(config, scans, variables)
@@ -75,11 +67,7 @@ def evaluate(
 def registered(
     config: Experiment, scans: ScanSet, variables: Variables, *, progress: bool = True
 ) -> Results:
-    """The registrations of the test views; see `evaluate`.
-
-    Raises:
-      InputError: there are no test views.
-    """
+    """The registrations of the test views; InputError if there are none."""
     test = scans.test
     if not len(test):
         raise InputError("no test views: none of config.views.azimuths_deg is a multiple of 40 deg")
@@ -109,11 +97,7 @@ def report_of(config: Experiment, scans: ScanSet, results: Results) -> dict[str,
 def load_variables(
     config: Experiment, scans: ScanSet, folder: Path, *, which: str = "latest"
 ) -> Variables:
-    """The averaged weights of a run's "latest" or "best" checkpoint.
-
-    Raises:
-      InputError: no checkpoint there, or one of another model.
-    """
+    """Averaged weights of a run's "latest" or "best" checkpoint; InputError if none is there."""
     bank = make_bank(scans, num_reference=config.data.num_reference)
     like = jax.eval_shape(lambda: config.initial_state(bank, config.pair_sampling(scans)))
     path = RunFolder(folder).checkpoints

@@ -1,7 +1,4 @@
-"""Fine registration against the Cramer-Rao bound, over views of the guide vane and noise levels.
-
-See `experiments.studies.fine`.
-"""
+"""Fine registration against the Cramer-Rao bound, over views of the guide vane and noise levels."""
 
 from experiments.runner import study_command
 from experiments.studies.fine.study import main, make_parser

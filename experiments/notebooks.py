@@ -43,11 +43,7 @@ def source_hash(notebook: NotebookNode) -> str:
 
 
 def execute(notebook: NotebookNode, folder: Path, environment: Mapping[str, str] = {}) -> None:
-    """Runs the cells in a kernel of their own, in ``folder``; outputs replace the old ones.
-
-    Raises:
-      nbclient.exceptions.CellExecutionError: a cell failed.
-    """
+    """Runs the cells in a kernel of their own, in ``folder``; raises CellExecutionError."""
     client = nbclient.NotebookClient(
         notebook,
         timeout=300,

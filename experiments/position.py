@@ -1,7 +1,4 @@
-"""Section IV of the paper on a virtual stand: how truly turns and moves of a part are recognised.
-
-See `experiments.studies.position`.
-"""
+"""Section IV of the paper on a virtual stand: how truly turns and moves are recognised."""
 
 from experiments.runner import study_command
 from experiments.studies.position.study import main, make_parser

@@ -1,7 +1,4 @@
-"""Registers real scans without guess or training, against ground truth.
-
-See `experiments.studies.real_scans`.
-"""
+"""Registers real scans without guess or training, against ground truth."""
 
 from experiments.runner import study_command
 from experiments.studies.real_scans.study import main, make_parser

@@ -53,11 +53,7 @@ def write_docs() -> None:
 
 
 def quick(out: Path, weights: str) -> None:
-    """Writes the page of the recorded results, with the weights evaluated again.
-
-    Raises:
-      InputError: weights that cannot be used, or a folder that cannot be written.
-    """
+    """Writes the page of the recorded results, with the weights evaluated again."""
     page = _page(out)
     matcher = find_weights(weights, guide_vane())
     words = "those that come with the package" if weights == PRETRAINED else Path(weights).name
@@ -73,11 +69,7 @@ def quick(out: Path, weights: str) -> None:
 
 
 def full(out: Path, inputs: dict[str, str], only: str | None) -> list[Outcome]:
-    """Trains and measures everything again, and writes the page.
-
-    Raises:
-      InputError: an unknown study, or a folder that cannot be written.
-    """
+    """Trains and measures everything again, and writes the page."""
     page = _page(out)
     outcomes = run_studies(chosen(only), out, inputs, say=lambda text: print(text, flush=True))
     write_text(out / "outcomes.json", outcomes_json(outcomes))

@@ -1,7 +1,4 @@
-"""How registration stands what happens at a machine: distance, angle, light, clutter, casting.
-
-See `experiments.studies.robustness`.
-"""
+"""How registration stands what happens at a machine: distance, angle, light, clutter, casting."""
 
 from experiments.runner import study_command
 from experiments.studies.robustness.study import main, make_parser

@@ -1,7 +1,4 @@
-"""Every effect of the sensor alone: a picture to check by eye, and what it costs.
-
-See `experiments.studies.sensor_effects`.
-"""
+"""Every effect of the sensor alone: a picture to check by eye, and what it costs."""
 
 from experiments.runner import study_command
 from experiments.studies.sensor_effects.study import main, make_parser

@@ -1,7 +1,4 @@
-"""How alike virtual and real scans are, effect by effect, and a sensor fitted to the real ones.
-
-See `experiments.studies.sensor_fit`.
-"""
+"""How alike virtual and real scans are, effect by effect, and a sensor fitted to the real ones."""
 
 from experiments.runner import study_command
 from experiments.studies.sensor_fit.study import main, make_parser

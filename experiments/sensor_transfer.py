@@ -1,7 +1,4 @@
-"""What a network that saw virtual scans is worth on real ones, by how real the virtual ones were.
-
-See `experiments.studies.sensor_transfer`.
-"""
+"""What a network that saw virtual scans is worth on real ones, by how real they were."""
 
 from experiments.runner import study_command
 from experiments.studies.sensor_transfer.study import main, make_parser

@@ -19,8 +19,7 @@ from experiments.runner.experiment import Experiment
 from experiments.runner.run_folder import RunFolder, training_record
 from experiments.runner.stopping import Interrupted, stop_signal
 from experiments.runner.training_banks import training_banks
-from experiments.runner.training_log import TrainingLog
-from experiments.runner.validation import make_validation
+from experiments.runner.training_log import TrainingLog, make_validation
 from vanejax.cad import Part
 from vanejax.training import (
     Checkpoints,

@@ -91,11 +91,7 @@ def score_deg(results: Results) -> float:
 
 
 def tune(config: Comparison, workdir: Path, methods: Sequence[str], views: int) -> dict[str, Any]:
-    """Runs the grids on ``views`` training views, spread over all; returns what tuning.json holds.
-
-    Raises:
-      InputError: a method that has no grid, or no training views.
-    """
+    """The grids on ``views`` training views, spread over all; gives what tuning.json holds."""
     unknown = [name for name in methods if name not in GRIDS]
     if unknown or not methods:
         raise InputError(f"methods {', '.join(unknown)}: only {', '.join(GRIDS)} are tuned")

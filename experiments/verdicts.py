@@ -1,7 +1,4 @@
-"""How well the verdict tells right poses from wrong ones, over parts and sensors.
-
-See `experiments.studies.verdicts`.
-"""
+"""How well the verdict tells right poses from wrong ones, over parts and sensors."""
 
 from experiments.runner import study_command
 from experiments.studies.verdicts.study import main, make_parser

@@ -36,10 +36,7 @@ def start(bench: Bench) -> Iterator[Figure]:
 
 
 def command(bench: Bench) -> Iterator[Figure]:
-    """`vanejax register` as a process: with an empty compilation cache, then with a full one.
-
-    Against a process that imports JAX and leaves.
-    """
+    """`vanejax register` as a process, with an empty and a full cache; against JAX's import."""
     seconds = [run(["-c", "import jax"]) for _ in range(bench.repeats)]
     yield Figure("python -c 'import jax'", seconds)
     with tempfile.TemporaryDirectory() as folder:
@@ -78,22 +75,14 @@ def measured(module: str, *arguments: str, **environment: str) -> dict[str, floa
 
 
 def run(arguments: Sequence[str], **environment: str) -> float:
-    """Seconds of a Python process.
-
-    Raises:
-      InputError: it ended with neither success nor a verdict.
-    """
+    """Seconds of a Python process; errors as of `output`."""
     began = time.perf_counter()
     output(arguments, **environment)
     return time.perf_counter() - began
 
 
 def output(arguments: Sequence[str], **environment: str) -> str:
-    """What a Python process prints.
-
-    Raises:
-      InputError: it ended with neither success nor a verdict.
-    """
+    """What a Python process prints; InputError if it ended with neither success nor a verdict."""
     done = subprocess.run(
         [sys.executable, *arguments],
         env=os.environ | environment,

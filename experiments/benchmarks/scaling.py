@@ -123,12 +123,11 @@ def over_resolution(bench: Bench, resolutions: tuple[float, ...]) -> Iterator[Se
     """One scan with more and more pixels."""
     scanner, pose = bench.views.model.scanner, bench.views.viewpoints.view(bench.view)
     cameras = [bench.views.camera.scaled(factor) for factor in resolutions]
-    camera_of = {camera.width * camera.height: camera for camera in cameras}
-
-    def runs_of(pixels: int) -> dict[str, Callable[[], Any]]:
-        return {"one scan, pixels": functools.partial(scanner.scan, camera_of[pixels], pose)}
-
-    yield from over("pixels", list(camera_of), runs_of, bench.time_sparingly)
+    seconds = [
+        bench.time_sparingly(functools.partial(scanner.scan, camera, pose)) for camera in cameras
+    ]
+    pixels = [camera.width * camera.height for camera in cameras]
+    yield Series("one scan, pixels", "pixels", pixels, seconds)
 
 
 def over_points(bench: Bench, counts: tuple[int, ...]) -> Iterator[Series]:
@@ -184,10 +183,7 @@ def over_network(bench: Bench, sizes: Sizes) -> Iterator[Series]:
 
 
 def exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float | None:
-    """The slope of log time over log size at the largest sizes: 1 is linear, 2 quadratic.
-
-    None for fewer than two sizes.
-    """
+    """The slope of log time over log size at the largest sizes: 1 is linear; None for one size."""
     if len(sizes) < 2:
         return None
     x, y = (np.log(values[-FITTED:]) for values in (sizes, seconds))

@@ -79,15 +79,7 @@ GROUPS = {"figures": ("times", "scaling")}  # blocks of several
 
 
 def block(name: str, results: Mapping[str, Report]) -> str:
-    """The body of a block, with the provenance of its record below.
-
-    Args:
-      name: between its marks.
-      results: records by name.
-
-    Raises:
-      KeyError: no block has this name, or there is no record of it.
-    """
+    """The body of a block with the provenance of its record below; KeyError for an unknown name."""
     if name == "measured":
         return tables.summary_table(results)
     if name in GROUPS:

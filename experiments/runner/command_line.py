@@ -88,11 +88,7 @@ def run(main: Callable[[], object], *, tree: type = Experiment) -> None:
 
 
 def resolve_config(argv: list[str]) -> list[str]:
-    """Replaces a bare config name by its path: the working folder first, then ours.
-
-    Raises:
-      InputError: no such file; names the ones there are.
-    """
+    """Replaces a bare config name by its path: the working folder first, then ours."""
     argv = list(argv)
     for index, argument in enumerate(argv):
         name, equals, value = argument.partition("=")
@@ -152,11 +148,7 @@ def kind_of(config: Any, path: str) -> str:
 
 
 def check_field(config: Any, path: str) -> None:
-    """Refuses a path such as ``model.num_neighbors`` that names no field of the config.
-
-    Raises:
-      InputError: names what is there, and what is near.
-    """
+    """Refuses a path such as ``model.num_neighbors`` that names no field, and says what is near."""
     node: Any = config
     walked = "config"
     for name in path.split("."):

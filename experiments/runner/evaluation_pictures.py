@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from experiments.runner.experiment import Experiment
 from experiments.runner.registrations import Results
 from vanejax import plotting
 from vanejax.cad import Part
-from vanejax.scanner import Scanner, hemisphere_viewpoints
+from vanejax.scanner import Camera, Scan, Scanner, Viewpoints, hemisphere_viewpoints
 from vanejax.training import ScanSet
 
 PORTRAIT_PIXELS = 2.0  # times the camera's per side: the picture is printed larger than a scan
@@ -61,11 +62,8 @@ def draw_with_part(
     """view_and_shadow.png, Fig. 5 for the hardest views, and overview.png."""
     scanner = Scanner(part, surface_samples=SURFACE_SAMPLES)
     camera, views = config.make_camera(), scans.viewpoints
-    seen = [scanner.scan(camera, views.view(view), hidden=True) for view in hardest]
-    names = [
-        plotting.view_name(views.elevation_deg[view], views.azimuth_deg[view]) for view in hardest
-    ]
-    plotting.save_figure(plotting.view_and_shadow(seen, names), folder / "view_and_shadow.png")
+    figure, seen = shadow_picture(scanner, camera, views, hardest)
+    plotting.save_figure(figure, folder / "view_and_shadow.png")
 
     fine = camera.scaled(PORTRAIT_PIXELS)
     eye = hemisphere_viewpoints(
@@ -78,6 +76,17 @@ def draw_with_part(
     shown = overlay(results, scans, hardest[0])
     figure = plotting.overview_picture(portrait, fine, seen[0], shown)
     plotting.save_figure(figure, folder / "overview.png")
+
+
+def shadow_picture(
+    scanner: Scanner, camera: Camera, views: Viewpoints, shown: Sequence[int]
+) -> tuple[Figure, list[Scan]]:
+    """What some views see and what the part hides from them, the paper's Fig. 5; their scans."""
+    scans = [scanner.scan(camera, views.view(view), hidden=True) for view in shown]
+    names = [
+        plotting.view_name(views.elevation_deg[view], views.azimuth_deg[view]) for view in shown
+    ]
+    return plotting.view_and_shadow(scans, names), scans
 
 
 def overlay(results: Results, scans: ScanSet, view: int) -> plotting.Overlay:

@@ -89,10 +89,7 @@ def git_commit() -> str | None:
 
 
 def flops_per_second(repeats: int, size: int = MATMUL_SIZE) -> list[float]:
-    """The rate of each of some products of two square float32 matrices in JAX.
-
-    This is what the machine can do at best, which a network's arithmetic is measured against.
-    """
+    """The best rate of this machine: that of each of some square float32 matrix products in JAX."""
     matrix = jnp.ones((size, size), jnp.float32)
     multiply = jax.jit(jnp.matmul)
     multiply(matrix, matrix).block_until_ready()

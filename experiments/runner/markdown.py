@@ -36,12 +36,8 @@ def slug(title: str) -> str:
 def with_blocks(page: str, body_of: Callable[[str], str]) -> str:
     """A page with every block between ``<!-- NAME -->`` and ``<!-- end of NAME -->`` made anew.
 
-    Args:
-      page: Markdown.
-      body_of: the text of a block by its name; KeyError for an unknown name.
-
-    Raises:
-      ValueError: a mark without its partner, or a block of an unknown name.
+    ``body_of`` gives the text of a block by its name, or KeyError. Raises ValueError for a mark
+    without its partner and for an unknown name.
     """
     names = [match[1] for match in _BLOCK.finditer(page)]
     ends = re.findall(r"<!-- end of (.+?) -->", page)

@@ -52,15 +52,8 @@ def register_views(
     """Draws a pair from each view of the bank, registers it from the identity and measures.
 
     View v draws its points, noise and pose from ``fold_in(fold_in(key(seed), TEST_STREAM), v)``:
-    the same pairs for every method, whatever it does.
-
-    Args:
-      register: any method; jitted already if it should be.
-      bank: V views.
-      sampling: as in training.
-      seed: of the pairs.
-      unit_mm: length of the unit-sphere unit, the part's radius.
-      progress: whether to show a progress bar.
+    the same pairs for every method, whatever it does. ``register`` should be jitted if it can be;
+    ``unit_mm`` is the length of the unit-sphere unit, the part's radius.
     """
     stream = jax.random.fold_in(jax.random.key(seed), TEST_STREAM)
     init = RigidTransform.identity()

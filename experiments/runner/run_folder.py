@@ -68,11 +68,7 @@ class RunFolder:
         return self.path / "metrics.jsonl"
 
     def claim(self, config: Experiment, part: Part) -> None:
-        """Records what runs here, or checks that it is the same as what ran here before.
-
-        Raises:
-          InputError: the folder holds a run of another config or part; names what differs.
-        """
+        """Records what runs here, or refuses what differs from what ran here before."""
         settings = json.loads(json.dumps(dataclasses.asdict(config)))
         mine = {"config": settings, "part": {"name": part.name, "sha256": part.sha256}}
         record = self.path / "run.json"
@@ -94,11 +90,7 @@ class RunFolder:
         write_json(record, mine | environment)
 
     def claim_shapes(self, title: str, sha256: str) -> None:
-        """Records which generic shapes a run is trained on, or checks that they are the same.
-
-        Raises:
-          InputError: the run was begun with other shapes.
-        """
+        """Records which generic shapes a run is trained on, or refuses others than before."""
         record, mine = self.path / "shapes.json", {"title": title, "sha256": sha256}
         if not record.exists():
             write_json(record, mine)
@@ -136,9 +128,6 @@ def read_record(folder: Path, config: Experiment) -> dict[str, Any]:
 
     A run of an earlier version lacks fields that came since; they have their defaults. Online
     scans were called endless, and the settings of a baseline's loss stood beside its network's.
-
-    Raises:
-      InputError: it cannot be read.
     """
     record = read_json(folder / "run.json")
     theirs = dict(record.get("config", {}))

@@ -17,11 +17,7 @@ class TrainingDiverged(RuntimeError):
 
 
 class Interrupted(RuntimeError):
-    """SIGINT or SIGTERM; the state is saved.
-
-    Attributes:
-      signal: its number.
-    """
+    """SIGINT or SIGTERM, the number ``signal``; the state is saved."""
 
     def __init__(self, number: int, step: int, folder: Path) -> None:
         name = signal.Signals(number).name
@@ -49,11 +45,9 @@ def stop_signal() -> Iterator[list[int]]:
 
 
 def exit_code(work: Callable[[], object]) -> int:
-    """Does the work of a command.
+    """Does the work of a command; its exit code, after a line on stderr where it is not 0.
 
-    Returns:
-      0; or, after a line on stderr, 2 where the input is at fault, 1 where a training diverged,
-      128 + N after signal N.
+    2 where the input is at fault, 1 where a training diverged, 128 + N after signal N.
     """
     # jaxlib announces TPUs and GPUs that are not there
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")

@@ -51,11 +51,7 @@ def header(method: str, settings: argparse.Namespace, part: Part | None = None) 
 
 
 def save(folder: Path, name: str, report: dict[str, Any]) -> dict[str, Any]:
-    """Writes ``name``.json; returns what it holds: six digits, and None for what is not finite.
-
-    Raises:
-      InputError: the folder cannot be written.
-    """
+    """Writes ``name``.json; returns what it holds: six digits, and None for what is not finite."""
     report = plain(report, DIGITS)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -24,12 +24,7 @@ LONGEST_NAME = 120  # of a cell's folder; file systems take 255 bytes
 
 @dataclasses.dataclass(frozen=True)
 class Sweep:
-    """One field of an `Experiment` and the values that it takes in turn.
-
-    Attributes:
-      field: its path, such as "model.num_neighbors".
-      values: of the field's own type, all different.
-    """
+    """The path of a field, such as "model.num_neighbors", and values of its type, all different."""
 
     field: str
     values: tuple[Any, ...]
@@ -39,10 +34,7 @@ class Sweep:
 class Cell:
     """One point of the grid with one seed: one training.
 
-    Attributes:
-      overrides: (field, value) pairs in the order of the fields' names, so that a grid has the
-        same cells whatever the order of its sweeps.
-      seed: of everything random.
+    ``overrides`` are in the order of the fields' names: an order of sweeps is no other grid.
     """
 
     overrides: tuple[tuple[str, Any], ...]
@@ -79,11 +71,7 @@ def grid(sweeps: Sequence[Sweep], seeds: Sequence[int]) -> list[Cell]:
 
 
 def check_used(cells: Sequence[Cell], base: Experiment) -> None:
-    """Refuses cells that change what their network does not use: they would be one training.
-
-    Raises:
-      InputError: names the field, and those that the network does use.
-    """
+    """Refuses cells that change what their network does not use: they would be one training."""
     for cell in cells:
         config = cell.config(base)
         for field, _ in cell.overrides:
@@ -97,10 +85,7 @@ def parse_sweeps(words: Sequence[str], config: Experiment) -> list[Sweep]:
     """Sweeps from ``FIELD=VALUE,VALUE,...``, each value typed as the config's field is.
 
     A tuple is written in brackets, a text with a comma in quotes:
-    ``views.elevations_deg=(60,70),(80,85)``.
-
-    Raises:
-      InputError: no sweep, another form, no such field, a value of another type, or one twice.
+    ``views.elevations_deg=(60,70),(80,85)``. Raises InputError for another form, field or type.
     """
     if not words:
         raise InputError("--sweep is missing; try --sweep model.num_neighbors=16,32")
@@ -112,11 +97,7 @@ def parse_sweeps(words: Sequence[str], config: Experiment) -> list[Sweep]:
 
 
 def parse_seeds(words: Sequence[str], default: int) -> tuple[int, ...]:
-    """Seeds from the words of a list; the default where there are none.
-
-    Raises:
-      InputError: no whole number of at least 0, or one twice.
-    """
+    """Whole numbers from 0, each once, from words; the default where there are none."""
     for word in words:
         if not word.isdecimal():
             raise InputError(f"--seeds: {word!r} should be a whole number, such as --seeds 0,1,2")
@@ -165,11 +146,7 @@ def _type_of(config: Experiment, field: str) -> Any:
 
 
 def _split(text: str) -> list[str]:
-    """The text at its commas, but for those inside brackets or quotes.
-
-    Raises:
-      ValueError: a bracket or a quote is not closed.
-    """
+    """The text at its commas, but for those inside brackets or quotes, which must be closed."""
     parts, depth, quote = [""], 0, ""
     for letter in text:
         if quote:
@@ -188,11 +165,7 @@ def _split(text: str) -> list[str]:
 
 
 def _parse_value(text: str, kind: Any) -> Any:
-    """A value of the type ``kind``.
-
-    Raises:
-      ValueError, SyntaxError: the text is none.
-    """
+    """A value of the type ``kind``; ValueError or SyntaxError where the text is none."""
     if typing.get_origin(kind) is tuple:
         value = ast.literal_eval(text)
         if not isinstance(value, tuple | list):

@@ -27,13 +27,7 @@ from vanejax.training.train_step import Variables
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
-    """Weights, and the run that they are of.
-
-    Attributes:
-      variables: averaged weights of the last step.
-      config: of the run.
-      record: of its training; None where only the weights are known.
-    """
+    """Averaged weights of a run's last step; no record where only the weights are known."""
 
     variables: Variables
     config: Experiment
@@ -45,16 +39,8 @@ def trained(
 ) -> Trained:
     """Trains in ``folder``, going on where a run there was interrupted; or loads what is ``given``.
 
-    Args:
-      config: the network, and how it is trained.
-      part, scans: what for.
-      folder: of a run to begin, to go on with, or that is finished.
-      given: the folder of another run, or a published RPM-Net's weights, see
-        `load_state_dict`.
-
-    Raises:
-      InputError: the given folder holds a run of another network, part or kind of data.
-      TrainingDiverged, Interrupted: as `experiments.train.fit`.
+    That is the folder of another run, or a published RPM-Net's weights, see `load_state_dict`.
+    Raises InputError if it is of another network, part or kind of data, else as `experiments.train.fit`.
     """
     if given is None:
         with RunFolder(folder) as run:
@@ -83,11 +69,7 @@ def trained(
 
 
 def given_runs(words: Iterable[str], names: Iterable[str]) -> dict[str, Path]:
-    """Folders, or files of weights, by network from ``NAME=PATH`` arguments.
-
-    Raises:
-      InputError: no such network or path, or an argument of another form.
-    """
+    """Folders, or files of weights, by network from ``NAME=PATH`` arguments."""
     runs: dict[str, Path] = {}
     for word in words:
         name, equals, folder = word.partition("=")

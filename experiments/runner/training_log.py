@@ -1,15 +1,22 @@
-"""The progress bar of a training, its log on disk, and the watch for divergence."""
+"""The progress bar of a training, its log on disk, its validation, and the watch for divergence."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from experiments.runner.experiment import Experiment
 from experiments.runner.run_folder import RunFolder
 from experiments.runner.stopping import TrainingDiverged
+from vanejax.matching import pose_metrics
+from vanejax.rigid import RigidTransform
 from vanejax.training.checkpoint import all_finite
-from vanejax.training.train_step import Metrics, TrainState
+from vanejax.training import PairSampling
+from vanejax.training.train_step import Bank, Metrics, TrainState, Variables
 
 DIVERGED = 20.0  # times the loss of the first rows: no run of use comes back from there
 
@@ -37,11 +44,7 @@ class TrainingLog:
         self._bar.update()
 
     def write(self, step: int) -> None:
-        """Logs the mean metrics of the steps since the last row.
-
-        Raises:
-          TrainingDiverged: a mean is not finite, or the loss has exploded.
-        """
+        """Logs the mean metrics since the last row; TrainingDiverged where they are of no use."""
         rows = jax.device_get(self._recent)
         self._recent = []
         values = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
@@ -63,11 +66,7 @@ class TrainingLog:
         )
 
     def write_validation(self, step: int, values: dict[str, float]) -> float:
-        """Logs validation errors; the score that the best checkpoint is chosen by.
-
-        Raises:
-          TrainingDiverged: an error is not finite.
-        """
+        """Logs validation errors, which must be finite; the score of the best checkpoint."""
         if not all(np.isfinite(value) for value in values.values()):
             raise TrainingDiverged(f"the validation at step {step} is not finite")
         self._folder.log(step, values)
@@ -77,3 +76,37 @@ class TrainingLog:
         """Raises TrainingDiverged where a weight is not finite: such a state is never saved."""
         if not all_finite((state.variables, state.average)):
             raise TrainingDiverged(f"weights not finite at step {step}")
+
+
+def make_validation(
+    config: Experiment, bank: Bank, sampling: PairSampling, radius_mm: float
+) -> Callable[[TrainState], dict[str, float]]:
+    """Mean errors on training entries, drawn with a key of their own: test views stay unseen."""
+    network, count = config.make_network(), config.training.validation_pairs
+    key = jax.random.fold_in(jax.random.key(config.seed), 0x7A11DA7E)
+    entries = jnp.linspace(0, bank.size - 1, count).astype(int)
+
+    @jax.jit
+    def errors(variables: Variables, bank: Bank) -> Metrics:
+        register = network.factory(network.model, variables, iterations=network.iterations)
+
+        def errors_of(number: jax.Array) -> Metrics:
+            draw_key, register_key = jax.random.split(jax.random.fold_in(key, number))
+            pairs = bank.draw(draw_key, entries[number][None], sampling)
+            source, truth = jax.tree.map(
+                lambda leaf: leaf[0], (pairs.source, pairs.target_from_source)
+            )
+            init = jax.tree.map(jnp.asarray, RigidTransform.identity())
+            result = register(source, pairs.target, init, register_key)
+            return pose_metrics(result.target_from_source, truth)
+
+        return jax.lax.map(errors_of, jnp.arange(count))
+
+    def validate(state: TrainState) -> dict[str, float]:
+        means = jax.tree.map(np.mean, jax.device_get(errors(state.average, bank)))
+        return {
+            "validation_rotation_error_deg": float(means["rotation_error_deg"]),
+            "validation_translation_error_mm": float(means["translation_error"]) * radius_mm,
+        }
+
+    return validate

@@ -18,11 +18,7 @@ from vanejax.scanner import Camera, Viewpoints, hemisphere_viewpoints
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class VaneViews:
-    """216 virtual scans of the built-in guide vane, made when asked for.
-
-    Attributes:
-      camera: of all views.
-    """
+    """216 virtual scans of the built-in guide vane by a camera, made when asked for."""
 
     camera: Camera = dataclasses.field(default_factory=Camera)
 
@@ -42,11 +38,7 @@ class VaneViews:
         return measurement_model(self.part, np.zeros(3))
 
     def select(self, which: str) -> list[int]:
-        """Indices of the views: "test" for the paper's 54, "all", or numbers such as 0,4,8.
-
-        Raises:
-          InputError: neither, or a view that is not there.
-        """
+        """Indices of the views: "test" for the paper's 54, "all", or numbers such as 0,4,8."""
         count = len(self.viewpoints)
         if which in ("test", "all"):
             return [v for v in range(count) if which == "all" or self.viewpoints.is_test[v]]
@@ -77,10 +69,7 @@ def with_noise(points: np.ndarray, noise_mm: float, rng: np.random.Generator) ->
 def perturb(
     pose: RigidTransform, part: Part, *, deg: float, mm: float, rng: np.random.Generator
 ) -> RigidTransform:
-    """part_from_camera turned by exactly ``deg`` and moved by ``mm`` at the part's centre.
-
-    Axis and direction are random.
-    """
+    """The pose turned by ``deg`` and moved by ``mm`` at the part's centre, in any direction."""
     axis, direction = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
     delta = np.concatenate([np.radians(deg) * axis, mm * direction])
     batch = moved(part, stack(pose), delta[None])

@@ -120,11 +120,8 @@ def better_if(better: bool) -> Verdict:
 def over_floor(value: float, floor: float, paper: float, why: str) -> Finding:
     """Whether a metric (mm) is better than the paper's, where the pose decides it.
 
-    Args:
-      value: measured.
-      floor: the metric at the true pose; a value up to `VISIBLE` times it is not comparable.
-      paper: its figure.
-      why: what decides the metric where the pose does not.
+    ``floor`` is the metric at the true pose: a value up to `VISIBLE` times it is not comparable,
+    and ``why`` says what decides the metric there.
     """
     side = "Below" if value < paper else "Above"
     ours = f"{digits(value, 3)} mm"

@@ -108,14 +108,10 @@ def document(
     docs: Path | None = None,
     run: Path | None = None,
 ) -> Document:
-    """The report of some records.
+    """The report of some records, by name.
 
-    Args:
-      results: records by name.
-      mode: how they were made, in a sentence.
-      live: what was measured for the report.
-      outcomes: of the studies of a run; none where recorded results are shown.
-      docs, run: see `Document`.
+    ``mode`` says how they were made, ``live`` is what was measured for the report, ``outcomes`` are
+    of the studies of a run; ``docs`` and ``run`` are as in `Document`.
     """
     kept: list[Picture | Folded] = []
 

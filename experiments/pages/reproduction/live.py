@@ -48,14 +48,8 @@ def evaluate_live(
 ) -> Live:
     """Scans the test views anew and registers them, as `experiments.evaluate` does.
 
-    Args:
-      matcher: of the guide vane.
-      weights: where it is from, for the reader.
-      out: evaluation.json and pictures go to its folder vane.
-      config: the recipe, `vane.py` if not given; its views and points.
-
-    Raises:
-      InputError: weights for another part, or of a network that `config` does not describe.
+    The recipe is `vane.py` if no ``config`` is given. Raises InputError for weights of another part
+    or recipe.
     """
     config = vane.get_config() if config is None else config
     part = config.make_part()
@@ -77,11 +71,7 @@ def measure_position(out: Path) -> dict[str, Any]:
 
 
 def check_recipe(matcher: TrainedMatcher, config: Experiment) -> None:
-    """Refuses weights whose network or thinning differs from the config's.
-
-    Raises:
-      InputError: names what differs.
-    """
+    """Refuses weights whose network or thinning differs from the config's, and names what does."""
     network, data = config.make_network(), config.data
     sampling = matcher.sampling
     fields = {

@@ -73,9 +73,7 @@ def _html(part: Part, report: Document, name: str) -> str:
 def to_html(text: str, name: str) -> str:
     """Markdown as HTML, without any HTML of its own.
 
-    Args:
-      text: Markdown.
-      name: of the section: its tables and blocks that scroll are labelled by it.
+    The section's ``name`` labels its tables and blocks that scroll.
     """
     tokens = _MARKDOWN.parse(text)
     for place, token in enumerate(tokens):

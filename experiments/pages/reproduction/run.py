@@ -62,16 +62,10 @@ def run_studies(
     *,
     say: Callable[[str], None] = print,
 ) -> list[Outcome]:
-    """Runs the studies in order; every one has its outcome.
+    """Runs the studies in order, those needed by others first; every one has its outcome.
 
-    Args:
-      studies: those needed by others first.
-      out: folder; each study's own is inside, as are logs/NAME.txt and ended/NAME.json.
-      inputs: of `INPUTS`, those that there are.
-      say: receives the lines of progress.
-
-    Raises:
-      InputError: the folder cannot be written.
+    Each has its own folder in ``out``, beside logs/NAME.txt and ended/NAME.json; ``say`` receives
+    the lines of progress. Raises InputError where the folder cannot be written.
     """
     try:
         for name in ("logs", "ended"):

@@ -67,14 +67,7 @@ class Study:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """The outcome of a study.
-
-    Attributes:
-      study: which.
-      state: "done", "done before", "failed" or "not run".
-      why: of the last two, in a line.
-      seconds: that it took.
-    """
+    """The state of a study ("done", "done before", "failed", "not run"), and why in a line."""
 
     study: Study
     state: str
@@ -111,11 +104,7 @@ def recorded(folder: Path = RESULTS) -> dict[str, Any]:
 
 
 def chosen(names: str | None) -> tuple[Study, ...]:
-    """Studies by name, with those that they need, in the table's order; all where None.
-
-    Raises:
-      InputError: an unknown name.
-    """
+    """Studies by name, with those that they need, in the table's order; all where None."""
     if names is None:
         return STUDIES
     by_name = {study.name: study for study in STUDIES}

@@ -18,7 +18,6 @@ from experiments.benchmarks import (
     compilation,
     evaluation,
     network,
-    peers,
     processes,
     registration,
     scaling,
@@ -104,7 +103,7 @@ def test_the_largest_view_is_taken(bench: Bench) -> None:
 
 
 @pytest.mark.usefixtures("_no_peers")
-@pytest.mark.parametrize("time", [peers.open3d_icp, peers.small_gicp_icp])
+@pytest.mark.parametrize("time", [registration.open3d_icp, registration.small_gicp_icp])
 def test_a_peer_that_is_not_installed_is_skipped(time, bench: Bench) -> None:
     figure = time(bench)
     assert (list(figure.seconds), figure.note[:25]) == ([], "skipped: No module named ")
