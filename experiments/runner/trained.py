@@ -40,7 +40,7 @@ def trained(
     """Trains in ``folder``, going on where a run there was interrupted; or loads what is ``given``.
 
     That is the folder of another run, or a published RPM-Net's weights, see `load_state_dict`.
-    Raises InputError if it is of another network, part or kind of data, else as `experiments.train.fit`.
+    Raises InputError if it is of another network, part or kind of data.
     """
     if given is None:
         with RunFolder(folder) as run:
