@@ -6,10 +6,9 @@ import dataclasses
 import difflib
 import functools
 import importlib.util
-import itertools
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +28,10 @@ _OVERRIDE = re.compile(r"--?config\.([^=]+)")
 
 def define_config() -> flags.FlagHolder:
     """Defines ``--config``; its value is what `run` is told it is once flags are parsed."""
-    names = ", ".join(sorted(path.name for path in CONFIG_FOLDER.glob("[!_]*.py")))
     return config_flags.DEFINE_config_file(
         "config",
         None,
-        f"a file with get_config(), here or in experiments/configs/ ({names}). Any field can be "
+        f"a file with get_config(), here or in experiments/configs/ ({_names()}). Any field can be "
         "overridden: --config.model.num_neighbors=16",
     )
 
@@ -90,23 +88,27 @@ def run(main: Callable[[], object], *, tree: type = Experiment) -> None:
 def resolve_config(argv: list[str]) -> list[str]:
     """Replaces a bare config name by its path: the working folder first, then ours."""
     argv = list(argv)
-    for index, argument in enumerate(argv):
-        name, equals, value = argument.partition("=")
-        if name not in ("--config", "-config"):
-            continue
-        if not equals:
-            if index + 1 == len(argv):
-                raise InputError("--config needs a file, such as --config vane.py")
-            value = argv[index + 1]
+    for index, before, value in _configs(argv):
         path = next((p for p in (Path(value), CONFIG_FOLDER / value) if p.is_file()), None)
         if path is None:
-            there = ", ".join(sorted(p.name for p in CONFIG_FOLDER.glob("[!_]*.py")))
-            raise InputError(f"no config {value!r} here or in experiments/configs/: {there}")
-        if equals:
-            argv[index] = f"{name}={path}"
-        else:
-            argv[index + 1] = str(path)
+            raise InputError(f"no config {value!r} here or in experiments/configs/: {_names()}")
+        argv[index] = f"{before}{path}"
     return argv
+
+
+def _names() -> str:
+    """The config files that there are."""
+    return ", ".join(sorted(path.name for path in CONFIG_FOLDER.glob("[!_]*.py")))
+
+
+def _configs(argv: Sequence[str]) -> Iterator[tuple[int, str, str]]:
+    """Every value of ``--config``: the place of its word, what stands before it there, and it."""
+    for index, argument in enumerate(argv):
+        name, equals, value = argument.partition("=")
+        if name in ("--config", "-config"):
+            if not equals and index + 1 == len(argv):
+                raise InputError("--config needs a file, such as --config vane.py")
+            yield (index, f"{name}=", value) if equals else (index + 1, "", argv[index + 1])
 
 
 def _parse(tree: type, argv: list[str]) -> list[str]:
@@ -127,14 +129,11 @@ def _parse(tree: type, argv: list[str]) -> list[str]:
 
 def _load(argv: list[str]) -> Any:
     """What the config file of a command line holds before overrides; None where none is named."""
-    for argument, following in itertools.zip_longest(argv, argv[1:]):
-        name, equals, value = argument.partition("=")
-        if name in ("--config", "-config"):
-            path = value if equals else following
-            spec = importlib.util.spec_from_file_location("config_of_this_command", path)
-            module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-            spec.loader.exec_module(module)
-            return module.get_config()
+    for _, _, path in _configs(argv):
+        spec = importlib.util.spec_from_file_location("config_of_this_command", path)
+        module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module.get_config()
     return None
 
 

@@ -87,6 +87,10 @@ def register(method, config: Experiment, scans: ScanSet, bank: ScanBank) -> Resu
     )
 
 
+def report_of(results: Results, scans: ScanSet) -> dict:
+    return plain(summarize(results, scans.test) | {"method": "a test", "part": {"name": "vane"}})
+
+
 def test_doing_nothing_is_as_wrong_as_the_pose_drawn(
     config: Experiment, scans: ScanSet, bank: ScanBank
 ) -> None:
@@ -124,7 +128,7 @@ def test_what_is_not_finite_is_counted_and_left_out(
     config: Experiment, scans: ScanSet, bank: ScanBank
 ) -> None:
     results = register(lose_some, config, scans, bank)
-    report = plain(summarize(results, scans.test) | {"method": "a test", "part": {"name": "vane"}})
+    report = report_of(results, scans)
     lost = results.pairs.source.xyz[:, 0, 0] > 0
     assert 0 < lost.sum() < 6  # or this test says nothing
     assert report["non_finite_views"] == lost.sum()
@@ -145,8 +149,7 @@ def test_a_method_that_always_fails_has_no_figures(
     def fail(*arguments) -> Registration:
         return jax.tree.map(lambda leaf: leaf * jnp.nan, stay(*arguments))
 
-    results = register(fail, config, scans, bank)
-    report = plain(summarize(results, scans.test) | {"method": "a test", "part": {"name": "vane"}})
+    report = report_of(register(fail, config, scans, bank), scans)
     assert report["summary"]["rotation_error_deg"]["mean"] is None
     assert report["mre_per_axis_deg"] == [None] * 3
     assert "WARNING: 6 of 6 views" in table(report)

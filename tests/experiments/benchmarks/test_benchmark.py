@@ -103,9 +103,18 @@ def test_the_largest_view_is_taken(bench: Bench) -> None:
 
 
 @pytest.mark.usefixtures("_no_peers")
-@pytest.mark.parametrize("time", [registration.open3d_icp, registration.small_gicp_icp])
-def test_a_peer_that_is_not_installed_is_skipped(time, bench: Bench) -> None:
-    figure = time(bench)
+@pytest.mark.parametrize(
+    ("time", "more"),
+    [
+        (registration.open3d_icp, ()),
+        (registration.small_gicp_icp, ()),
+        (scanning.open3d_scan, (range(1), 1.0, "")),
+        (network.torch_step, (VanePairs(),)),
+        (network.torch_inference, (VanePairs(),)),
+    ],
+)
+def test_a_peer_that_is_not_installed_is_skipped(time, more: tuple, bench: Bench) -> None:
+    figure = time(bench, *more)
     assert (list(figure.seconds), figure.note[:25]) == ([], "skipped: No module named ")
 
 
@@ -196,22 +205,6 @@ def test_the_network_stands_beside_pytorch_and_arithmetic(once: Bench) -> None:
         kinds = [(entry["kind"], entry["ratio"] > 0) for entry in rows[2]["against"]]
         assert kinds == [("peer", True), ("limit", True)]
         assert "32 x 64 points, k = 4" in rows[2]["note"]
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("_small_network", "_no_peers")
-def test_peers_that_are_not_there_are_skipped_with_a_word(once: Bench) -> None:
-    def unlike_ours(figures: Iterator[Figure]) -> list[Figure]:
-        return [figure for figure in figures if not figure.seconds]
-
-    for benchmark_of, count in (
-        (scanning.scan, 1),
-        (network.inference, 1),
-        (registration.refine_against_casts, 2),
-    ):
-        skipped = unlike_ours(benchmark_of(once))
-        assert len(skipped) == count
-        assert all("skipped: No module named" in figure.note for figure in skipped)
 
 
 @pytest.mark.slow
