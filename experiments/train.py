@@ -21,11 +21,7 @@ from experiments.runner.stopping import Interrupted, stop_signal
 from experiments.runner.training_banks import training_banks
 from experiments.runner.training_log import TrainingLog, make_validation
 from vanejax.cad import Part
-from vanejax.training import (
-    Checkpoints,
-    TrainState,
-    restore_or,
-)
+from vanejax.training import Checkpoints, TrainState, restore_or
 from vanejax.training.dataset import ScanSet, describe_source, load_scan_set, make_scan_set
 
 

@@ -12,9 +12,9 @@ import json
 import time
 from collections.abc import Iterator
 
+from experiments.benchmarks.network import VanePairs
 from experiments.benchmarks.processes import first_and_later, measured
 from experiments.benchmarks.timing import Bench, Figure
-from experiments.benchmarks.vane_pairs import VanePairs
 from vanejax import compilation_cache
 
 NEAR_ZERO_S = 1.0

@@ -26,12 +26,7 @@ from experiments.configs.vane import get_config
 from experiments.runner import evaluation_pictures as pictures
 from experiments.runner.evaluation_report import hardest_views, table
 from vanejax import compilation_cache
-from vanejax.training import (
-    ScanSet,
-    load_scan_set,
-    make_bank,
-    make_scan_set,
-)
+from vanejax.training import ScanSet, load_scan_set, make_bank, make_scan_set
 
 
 def evaluation(bench: Bench) -> Iterator[Figure]:

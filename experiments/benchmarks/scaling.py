@@ -13,9 +13,8 @@ import manifold3d
 import numpy as np
 import trimesh
 
-from experiments.benchmarks.network import registering, training
+from experiments.benchmarks.network import VanePairs, registering, training
 from experiments.benchmarks.timing import NOISE_MM, Bench, shown
-from experiments.benchmarks.vane_pairs import VanePairs
 from experiments.runner import study_command as study
 from experiments.runner.vane_views import VaneViews, with_noise
 from vanejax.cad import Part, load_part

@@ -12,14 +12,7 @@ from dataclasses import field
 from vanejax.cad import Part, guide_vane, load_part
 from vanejax.errors import InputError
 from vanejax.scanner import Camera, Viewpoints, hemisphere_viewpoints
-from vanejax.settings import (
-    Settings,
-    bounded,
-    field_paths,
-    not_negative,
-    positive,
-    settings_class,
-)
+from vanejax.settings import Settings, bounded, field_paths, not_negative, positive, settings_class
 from vanejax.training import (
     OptimizerSettings,
     PairSampling,

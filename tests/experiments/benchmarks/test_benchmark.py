@@ -23,10 +23,10 @@ from experiments.benchmarks import (
     scaling,
     scanning,
 )
+from experiments.benchmarks.network import VanePairs
 from experiments.benchmarks.registration import CountedRays, bare_rays, register_from
 from experiments.benchmarks.scaling import Series
 from experiments.benchmarks.timing import Bench, Figure, summarize, table
-from experiments.benchmarks.vane_pairs import VanePairs
 from experiments.runner import machine
 from experiments.runner.vane_views import VaneViews
 from vanejax.errors import InputError

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +11,6 @@ import pytest
 
 from experiments.runner import study_command as study
 from vanejax.errors import InputError
-
-
-@pytest.mark.parametrize("values", [[3.0], [2.0, 1.0], [5.0, 1.0, 2.0], [4.0, 1.0, 3.0, 9.0]])
-def test_the_median_is_the_median(values: list[float]) -> None:
-    expected = {"median": statistics.median(values), "min": min(values), "max": max(values)}
-    assert study.spread(values) == expected
 
 
 @pytest.mark.parametrize("text", ["", "0", "-1", "a", "1,,2", "nan", "inf"])

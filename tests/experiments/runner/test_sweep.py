@@ -23,12 +23,7 @@ from vanejax.errors import InputError
 )
 def test_values_have_the_type_of_their_field(word: str, values: tuple) -> None:
     (sweep,) = parse_sweeps([word], get_config())
-    assert sweep.values == values
-    types = [type(value) for value in values]
-    assert [type(value) for value in sweep.values] == types
-    for found, wanted in zip(sweep.values, values, strict=True):
-        if isinstance(wanted, tuple):
-            assert all(type(entry) is float for entry in found)
+    assert repr(sweep.values) == repr(values)  # 8 is not 8.0
 
 
 @pytest.mark.parametrize(
