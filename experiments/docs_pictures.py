@@ -94,8 +94,8 @@ def scene_picture(views: Viewpoints, seed: int) -> Figure:
 
 def matching_picture(matcher: TrainedMatcher, part: Part, views: Viewpoints, seed: int) -> Figure:
     """The soft assignment of a noisy test view by the untrained and by the trained network."""
-    one = views.select(np.array([VIEW]))
-    scans = make_scan_set(part, matcher.camera, one, voxel_mm=matcher.voxel_mm, progress=False)
+    view = views.select(np.array([VIEW]))
+    scans = make_scan_set(part, matcher.camera, view, voxel_mm=matcher.voxel_mm, progress=False)
     bank = make_bank(scans, num_reference=matcher.sampling.num_reference)
     pairs = draw_pairs(jax.random.key(seed), bank, np.array([0]), matcher.sampling)
     source, truth = jax.tree.map(lambda leaf: leaf[0], (pairs.source, pairs.target_from_source))

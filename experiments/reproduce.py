@@ -23,12 +23,12 @@ from typing import Any
 from experiments.pages.reproduction.document import Document, document, to_markdown
 from experiments.pages.reproduction.live import evaluate_live, measure_position
 from experiments.pages.reproduction.page import to_page
-from experiments.pages.reproduction.run import estimate, measured, outcomes_json, run_studies
+from experiments.pages.reproduction.run import estimate, measured, run_studies
 from experiments.pages.reproduction.studies import ROOT, Outcome, chosen, recorded
 from experiments.runner import study_command as study
 from vanejax.cad import guide_vane
 from vanejax.errors import InputError
-from vanejax.files import check_writable, write_text
+from vanejax.files import check_writable, write_json, write_text
 from vanejax.training.weight_file import PRETRAINED, find_weights
 
 DOCS = ROOT / "docs"
@@ -72,7 +72,11 @@ def full(out: Path, inputs: dict[str, str], only: str | None) -> list[Outcome]:
     """Trains and measures everything again, and writes the page."""
     page = _page(out)
     outcomes = run_studies(chosen(only), out, inputs, say=lambda text: print(text, flush=True))
-    write_text(out / "outcomes.json", outcomes_json(outcomes))
+    rows = [
+        {"study": o.study.name, "state": o.state, "why": o.why, "seconds": round(o.seconds, 1)}
+        for o in outcomes
+    ]
+    write_json(out / "outcomes.json", rows)
     mode = "All results were trained and measured for this page."
     _write(page, document(measured(chosen(None), out), mode, outcomes=outcomes, run=out))
     return outcomes

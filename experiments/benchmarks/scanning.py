@@ -79,11 +79,8 @@ def bare_casts(bench: Bench, sample: range, scale: float, stated: str) -> Figure
     count = sum(len(directions) for _, directions in rays)
 
     def cast(strip: int) -> None:
-        def one(view_rays: tuple[np.ndarray, np.ndarray]) -> None:
-            run_strips(scene, *view_rays, strip)
-
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(one, rays))
+            list(pool.map(lambda view_rays: run_strips(scene, *view_rays, strip), rays))
 
     seconds = min((bench.time(lambda s=strip: cast(s))[0] for strip in STRIPS), key=np.median)
     rate = count / np.median(seconds) / 1e6

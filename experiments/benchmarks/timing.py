@@ -67,14 +67,9 @@ def peer(name: str) -> Callable[..., Callable[..., Figure]]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Bench:
-    """What is timed, made when asked for.
+    """What is timed, made when asked for: a view of the guide vane with noise, and a rough pose.
 
-    Attributes:
-      repeats: of each timing.
-      seed: of noise and rough pose.
-      weights: file of a trained matcher for the guide vane, or None.
-      large: whether sizes that take minutes are wanted too.
-      views: of the guide vane.
+    ``weights`` are the file of a trained matcher; ``large`` is for sizes that take minutes, too.
     """
 
     repeats: int

@@ -76,9 +76,9 @@ def perturb(
     return RigidTransform(batch.rotation[0], batch.translation[0])
 
 
-def pose_error(found: RigidTransform, truth: RigidTransform, center: np.ndarray) -> np.ndarray:
+def pose_error(pose: RigidTransform, truth: RigidTransform, center: np.ndarray) -> np.ndarray:
     """[6] the error as `Uncertainty` defines it: rad, then mm at the centre."""
-    error = truth @ found.inverse()
+    error = truth @ pose.inverse()
     shift = error.rotation @ center + error.translation - center
     return np.concatenate([Rotation.from_matrix(error.rotation).as_rotvec(), shift])
 

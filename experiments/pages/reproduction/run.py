@@ -6,7 +6,6 @@ not stop the rest.
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import time
@@ -117,12 +116,3 @@ def _last(log: Path) -> str:
     """The last line of a log."""
     lines = log.read_text(errors="replace").strip().splitlines() or ["it printed nothing"]
     return lines[-1].strip()[-_EXCERPT:]
-
-
-def outcomes_json(outcomes: Sequence[Outcome]) -> str:
-    """The outcomes of all studies, for a file."""
-    rows = [
-        {"study": o.study.name, "state": o.state, "why": o.why, "seconds": round(o.seconds, 1)}
-        for o in outcomes
-    ]
-    return json.dumps(rows, indent=2) + "\n"
