@@ -31,8 +31,7 @@ from vanejax.training.networks import (
     RpmNetNetwork,
 )
 from vanejax.training.online_scans import OnlineScans
-from vanejax.training.pairs import Bank
-from vanejax.training.train_step import Metrics
+from vanejax.training.train_step import Bank, Metrics
 
 # by the name of a network: the groups of settings that it uses
 NETWORKS = {

@@ -14,8 +14,8 @@ from experiments.runner.run_folder import RunFolder
 from experiments.runner.stopping import TrainingDiverged
 from vanejax.matching import pose_metrics
 from vanejax.rigid import RigidTransform
-from vanejax.training.checkpoint import all_finite
 from vanejax.training import PairSampling
+from vanejax.training.checkpoint import all_finite
 from vanejax.training.train_step import Bank, Metrics, TrainState, Variables
 
 DIVERGED = 20.0  # times the loss of the first rows: no run of use comes back from there
