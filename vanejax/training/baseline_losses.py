@@ -48,7 +48,8 @@ def cycle_loss(match: Match, source: PointCloud, target: PointCloud) -> jax.Arra
     partners = jnp.matmul(pointer, source.xyz, precision=jax.lax.Precision.HIGHEST)
     back = weighted_procrustes(target.xyz, partners, target.mask.astype(partners.dtype))
     still = jax.tree.map(jnp.asarray, RigidTransform.identity())
-    return sum(pose_parts(back @ match.target_from_source, still).values())
+    parts = pose_parts(back @ match.target_from_source, still)
+    return parts["rotation"] + parts["translation"]
 
 
 @settings_class
@@ -141,11 +142,9 @@ class PointNetLKLoss(_IterationsLoss):
     is a mean, left out by default: that of a partial scan is not 0 at the true pose.
 
     Attributes:
-      iterations: of the network in training; 10 as published.
-      discount: weight of an iteration relative to the next; 0 leaves the last alone.
+      iterations, discount, pairs_at_once: as of `RpmNetLoss`; 10 iterations as published.
       matrix: factor of `matrix_loss`; 1 as published.
       residual: factor of the mean square of the features' residual.
-      pairs_at_once: see `mean_over_pairs`.
     """
 
     iterations: int = positive(10)
@@ -173,11 +172,9 @@ class PcrNetLoss(_IterationsLoss):
     Here that half is left out; and since the true pose is known, it can be learned from directly.
 
     Attributes:
-      iterations: of the network in training; 8 as published.
-      discount: weight of an iteration relative to the next; 0 leaves the last alone.
+      iterations, discount, pairs_at_once: as of `RpmNetLoss`; 8 iterations as published.
       pose: factor of `pose_loss`; 0 as published.
       chamfer: factor of `chamfer_loss`.
-      pairs_at_once: see `mean_over_pairs`.
     """
 
     iterations: int = positive(8)

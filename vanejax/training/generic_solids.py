@@ -19,8 +19,7 @@ from vanejax.errors import InputError
 SEGMENTS = 64
 MOST_STEPS = 4  # primitives beside the first
 SQUARE_SHARE = 0.6  # of the primitives that stand along the axes, as in most machined parts
-# of the bounding box of the first primitive, along each side: where the others are put
-REACH = 0.5
+REACH = 0.5  # of the first primitive's bounding box, along each side: where the others are put
 SIZE_MM = 100.0  # of about the largest side: what `vanejax.cad.part` takes for a part
 LEAST_CHANGE = 0.02  # of the volume: a step that does less is not seen, and its slivers are
 LEAST_LEFT = 0.3  # of the volume, after a step

@@ -85,7 +85,7 @@ class RpmNetLoss(Settings):
 
     Attributes:
       iterations: of the network in training.
-      discount: weight of an iteration relative to the next.
+      discount: weight of an iteration relative to the next; 0 leaves the last alone.
       pose: factor of `pose_loss`; 1 as published.
       inlier: factor of `inlier_loss`; 0.01 as published.
       matching: factor of `matching_loss`; 0 as published.

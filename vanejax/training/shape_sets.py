@@ -75,22 +75,19 @@ def _shape_set(
 ) -> ShapeSet:
     """Checks samples [S, P, 6] and gives their normals unit length."""
     samples = samples.astype(np.float32)
-    if not np.isfinite(samples).all():
-        bad = names[int(np.argmin(np.isfinite(samples).all(axis=(1, 2))))]
-        raise InputError(f"{path}: shape {bad!r} has numbers that are not finite")
     points, normals = np.ascontiguousarray(samples[..., :3]), samples[..., 3:]
     reach = np.linalg.norm(points, axis=2).max(axis=1)
-    if np.any(reach > RADIUS):
-        raise InputError(
-            f"{path}: shape {names[int(np.argmax(reach))]!r} reaches {reach.max():.3g} from its "
-            "origin; shapes should be moved and scaled into the unit sphere"
-        )
-    length = np.linalg.norm(normals, axis=2)
     # a point on a face without area has no normal: it becomes a copy of one that has
-    usable = length > 0
-    if not usable.any(axis=1).all():
-        bad = names[int(np.argmin(usable.any(axis=1)))]
-        raise InputError(f"{path}: shape {bad!r} has no normals, all are of length zero")
+    usable = np.linalg.norm(normals, axis=2) > 0
+    problems = {
+        "has numbers that are not finite": ~np.isfinite(samples).all(axis=(1, 2)),
+        f"reaches {reach.max():.3g} from its origin; shapes should be moved and scaled into the "
+        "unit sphere": np.where(reach > RADIUS, reach, 0.0),
+        "has no normals, all are of length zero": ~usable.any(axis=1),
+    }
+    for words, extent in problems.items():
+        if extent.any():
+            raise InputError(f"{path}: shape {names[int(np.argmax(extent))]!r} {words}")
     row = np.where(usable, np.arange(usable.shape[1]), usable.argmax(axis=1)[:, None])[..., None]
     points, normals = (np.take_along_axis(part, row, axis=1) for part in (points, normals))
     normals = normals / np.linalg.norm(normals, axis=2, keepdims=True)
