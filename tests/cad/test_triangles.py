@@ -34,7 +34,7 @@ def soup_mesh(soup: np.ndarray) -> Triangles:
 @hypothesis.given(SOUPS)
 def test_welding_keeps_every_corner_and_sorts_the_distinct_ones(soup):
     mesh = weld(soup_mesh(soup))
-    np.testing.assert_array_equal(mesh.corners(), soup)
+    np.testing.assert_array_equal(mesh.points[mesh.faces], soup)
     distinct = {tuple(point) for point in soup.reshape(-1, 3).tolist()}
     assert [tuple(point) for point in mesh.points.tolist()] == sorted(distinct)
 
@@ -92,7 +92,7 @@ def test_figures_do_not_depend_on_how_many_faces_are_taken_at_a_time(monkeypatch
     np.testing.assert_allclose(mesh.volume(), whole.volume, rtol=1e-12)  # f64 eps x 1000
     np.testing.assert_allclose(mesh.areas(), whole.area_faces, rtol=1e-12)
     np.testing.assert_array_equal(mesh.bounds(), whole.bounds)
-    np.testing.assert_array_equal(np.concatenate(list(mesh.blocks())), mesh.corners())
+    np.testing.assert_array_equal(np.concatenate(list(mesh.blocks())), mesh.points[mesh.faces])
 
 
 @pytest.mark.slow

@@ -136,15 +136,12 @@ class Airfoil:
         arc_normals = _direction(arc_angles + math.pi / 2)
         arc = suction_end + arc_radius * (arc_normals - arc_normals[:1])
 
-        le_angles = np.linspace(
-            math.pi / 2 + beta[0] + inlet_wedge, 1.5 * math.pi + beta[0] - inlet_wedge,
-            _LEADING_EDGE + 1,
-        )  # fmt: skip
-        leading = le_center + le_radius * _direction(le_angles)
-        te_angles = np.linspace(
-            beta[1] + wedge - math.pi / 2, beta[1] - wedge + math.pi / 2, _TRAILING_EDGE + 1
-        )
-        trailing = te_radius * _direction(te_angles)
+        first, last = math.pi / 2 + beta[0] + inlet_wedge, 1.5 * math.pi + beta[0] - inlet_wedge
+        le_normals = _direction(np.linspace(first, last, _LEADING_EDGE + 1))
+        leading = le_center + le_radius * le_normals
+        first, last = beta[1] + wedge - math.pi / 2, beta[1] - wedge + math.pi / 2
+        te_normals = _direction(np.linspace(first, last, _TRAILING_EDGE + 1))
+        trailing = te_radius * te_normals
         if throat[0] <= leading[0, 0] or trailing[0, 0] <= leading[-1, 0]:
             raise InputError(
                 f"Airfoil: the throat lies {throat[0] - leading[0, 0]:.3g} mm behind the leading "
@@ -157,9 +154,9 @@ class Airfoil:
         pieces = [
             (arc, arc_normals),
             (upper[::-1], above[::-1]),
-            (leading, _direction(le_angles)),
+            (leading, le_normals),
             (lower, -below),
-            (trailing, _direction(te_angles)),
+            (trailing, te_normals),
         ]
         contour = np.concatenate([points[:-1] for points, _ in pieces])
         normals = np.concatenate([directions[:-1] for _, directions in pieces])

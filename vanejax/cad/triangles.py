@@ -24,12 +24,8 @@ class Triangles:
     points: np.ndarray
     faces: np.ndarray
 
-    def corners(self) -> np.ndarray:
-        """[F, 3, 3]: face, corner, coordinate."""
-        return self.points[self.faces]
-
     def blocks(self) -> Iterator[np.ndarray]:
-        """`corners` of some faces at a time: of all they would be larger than the mesh itself."""
+        """Corners [F, 3, 3] of some faces at a time: all would be larger than the mesh itself."""
         for start in range(0, len(self.faces), BLOCK):
             yield self.points[self.faces[start : start + BLOCK]]
 
@@ -155,12 +151,8 @@ class Edges:
         order = np.argsort(key, kind="stable")
         first = np.flatnonzero(_new(key[order]))
         upward = np.where(start < end, 1, -1)[order]
-        return cls(
-            ends,
-            order,
-            uses=np.diff(first, append=len(order)),
-            net=np.add.reduceat(upward, first),
-        )
+        uses, net = np.diff(first, append=len(order)), np.add.reduceat(upward, first)
+        return cls(ends, order, uses, net)
 
     def rows(self, which: np.ndarray) -> np.ndarray:
         """The rows, ascending, of the edges for which ``which`` [E] bool holds."""
@@ -196,15 +188,12 @@ def drop_doubled(mesh: Triangles, notes: list[str]) -> Triangles:
     even = ((a < b).astype(int) + (b < c) + (c < a)) == 2  # a rotation of the sorted triple
     net = np.bincount(group, np.where(even, 1, -1))
     two_sided = np.mean(net == 0) > 0.5
-    keep = np.zeros(len(group), bool)
-    keep[first[net != 0] if not two_sided else first] = True
+    keep = in_use(first if two_sided else first[net != 0], len(group))
     # the copy that stays must have the orientation that prevails
     wrong = keep & (np.where(even, 1, -1) * net[group] < 0)
     faces = np.where(wrong[:, None], mesh.faces[:, ::-1], mesh.faces)[keep]
-    notes.append(
-        f"dropped {counted(int(np.sum(~keep)), 'face')} "
-        + ("of a surface written two-sided" if two_sided else "that repeat or cancel another")
-    )
+    why = "of a surface written two-sided" if two_sided else "that repeat or cancel another"
+    notes.append(f"dropped {counted(int(np.sum(~keep)), 'face')} {why}")
     return Triangles(mesh.points, faces)
 
 
@@ -229,7 +218,7 @@ def areas(corners: np.ndarray) -> np.ndarray:
 
 def counted(number: int, noun: str) -> str:
     """A number with its noun in the singular or plural, for messages: ``3 vertices``."""
-    plural = noun[:-1] + "ies" if noun.endswith("y") else noun + ("es" if noun[-1] in "xs" else "s")
+    plural = noun[:-1] + "ies" if noun.endswith("y") else noun + "s"
     if noun == "vertex":
         plural = "vertices"
     return f"{number} {noun if number == 1 else plural}"
