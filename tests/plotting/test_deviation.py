@@ -231,7 +231,7 @@ def test_a_histogram_without_noise_or_partners_is_drawn(noise):
 
 def test_before_and_after_have_one_frame_and_differ():
     case = example_registration()
-    before, after = overlay_pictures(case.result, case.scan, case.part)
+    before, after = overlay_pictures(case.result, case.scan, Scene(case.part))
     assert before.extent_mm == after.extent_mm
     red, blue_ = (after.image[..., k] for k in (0, 2))
     solid = after.image[..., 3] == 1

@@ -266,13 +266,17 @@ def draw_dots(axes: Axes, clouds: Sequence[Dots], limit: np.ndarray) -> None:
     )
 
 
-def _scale_bar(axes: Axes, length_mm: float = 20.0) -> None:
-    """A bar of known length in the lower left corner, which `limits` keeps free."""
-    left, right = axes.get_xlim()
+def _scale_bar(axes: Axes) -> None:
+    """A bar of 20 mm in the lower left corner, which `limits` keeps free."""
     bottom, top = axes.get_ylim()
-    x, y = left + 0.02 * (right - left), bottom + 0.01 * (top - bottom)
+    y = bottom + 0.01 * (top - bottom)
+    draw_scale_bar(axes, 20.0, y, y + 0.012 * (top - bottom), "bottom")
+
+
+def draw_scale_bar(axes: Axes, length_mm: float, y: float, words_y: float, words_va: str) -> None:
+    """A bar of known length near the left edge at height ``y``, its length in words beside it."""
+    left, right = axes.get_xlim()
+    x = left + 0.02 * (right - left)
     axes.plot([x, x + length_mm], [y, y], color=INK, linewidth=1.5, solid_capstyle="butt")
-    axes.text(
-        x + length_mm / 2, y + 0.012 * (top - bottom), f"{length_mm:g} mm", color=INK,
-        fontsize=TICK_PT, ha="center", va="bottom",
-    )  # fmt: skip
+    axes.text(x + length_mm / 2, words_y, f"{length_mm:g} mm", color=INK, fontsize=TICK_PT,
+              ha="center", va=words_va)  # fmt: skip

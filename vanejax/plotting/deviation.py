@@ -40,18 +40,15 @@ _PANEL_IN = 3.2
 _MAX_DOTS = 100_000
 
 
-def deviation_map(
-    result: PoseResult, scan: MeasuredScan, part: Part, *, scene: Scene | None = None
-) -> Figure:
+def deviation_map(result: PoseResult, scan: MeasuredScan, part: Part) -> Figure:
     """Signed distance of the checked points to the CAD surface, from two sides.
 
     Args:
       result: with `Verification.deviation_mm`; points without a partner get a colour of their own.
       scan: what was registered.
       part: to what.
-      scene: of the same part, if there is one already.
     """
-    pictures = deviation_pictures(result, scan, part, scene=scene)
+    pictures = deviation_pictures(result, scan, Scene(part))
     limit = color_limit_mm(result.verification)
     mm_per_in = sum(picture.width_mm for picture in pictures) / (2 * _PANEL_IN)
     high = max(picture.width_mm * picture.height_per_width for picture in pictures) / mm_per_in
@@ -109,12 +106,8 @@ def residual_histogram(result: PoseResult) -> Figure:
             axes.axvline(edge, color=INK, linewidth=1, linestyle=(0, (4, 3)), label=label)
     beyond = np.count_nonzero(np.abs(deviation) > limit)
     if beyond:
-        axes.set_title(
-            f"{beyond:,} points lie beyond ±{limit:.3g} mm",
-            color=INK,
-            fontsize=LABEL_PT,
-            loc="right",
-        )
+        words = f"{beyond:,} points lie beyond ±{limit:.3g} mm"
+        axes.set_title(words, color=INK, fontsize=LABEL_PT, loc="right")
     axes.set_xlim(-limit, limit)
     entries = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
     order = dict.fromkeys([*(s.name.lower() for s in shown), *entries])
@@ -125,18 +118,15 @@ def residual_histogram(result: PoseResult) -> Figure:
     return figure
 
 
-def overlay_before_after(
-    result: PoseResult, scan: MeasuredScan, part: Part, *, scene: Scene | None = None
-) -> Figure:
+def overlay_before_after(result: PoseResult, scan: MeasuredScan, part: Part) -> Figure:
     """The scan on the CAD model at the first guess and at the result.
 
     Args:
       result: `PoseResult.before` and `PoseResult.part_from_camera` are drawn.
       scan: of more than 100,000 points a random choice is drawn.
       part: to what it was registered.
-      scene: of the same part, if there is one already.
     """
-    pictures = overlay_pictures(result, scan, part, scene=scene)
+    pictures = overlay_pictures(result, scan, Scene(part))
     figure = new_figure(WIDTH_IN, WIDTH_IN / 2 * pictures[0].height_per_width + 0.6)
     for axes, picture, title in zip(
         figure.subplots(1, 2), pictures, ("before", "after"), strict=True
@@ -165,61 +155,43 @@ def deviation_colors(deviation_mm: np.ndarray, limit_mm: float) -> np.ndarray:
     return colors
 
 
-def deviation_pictures(
-    result: PoseResult, scan: MeasuredScan, part: Part, *, scene: Scene | None = None
-) -> tuple[Picture, Picture]:
+def deviation_pictures(result: PoseResult, scan: MeasuredScan, scene: Scene) -> tuple[Picture, ...]:
     """The two pictures of `deviation_map`: as the sensor sees it, and from further round."""
-    scene = scene or Scene(part)
     verification = result.verification
     pose = result.part_from_camera
     some = _choice(len(verification.checked))
     points = pose.apply(scan.points[verification.checked[some]])
     colors = deviation_colors(verification.deviation_mm[some], color_limit_mm(verification))
-    first = reader_rotation(scan, part, pose)
-    second = reader_rotation(scan, part, pose, yaw_deg=OBLIQUE_YAW_DEG, pitch_deg=OBLIQUE_PITCH_DEG)
-    one, other = (
-        scene.draw(
-            reader, points, colors, frame=scene.frame(reader, [points]),
-            lift_mm=_lift_mm(result),
-        )
-        for reader in (first, second)
-    )  # fmt: skip
-    return one, other
+    # how far below the surface a point is still drawn on it: what noise alone may do
+    lift = verification.tolerance_mm if np.isfinite(verification.tolerance_mm) else 0.0
+    pictures = []
+    for yaw, pitch in ((0.0, 0.0), (OBLIQUE_YAW_DEG, OBLIQUE_PITCH_DEG)):
+        reader = reader_rotation(scan, scene.part, pose, yaw_deg=yaw, pitch_deg=pitch)
+        frame = scene.frame(reader, [points])
+        pictures.append(scene.draw(reader, points, colors, frame=frame, lift_mm=lift))
+    return tuple(pictures)
 
 
-def overlay_pictures(
-    result: PoseResult, scan: MeasuredScan, part: Part, *, scene: Scene | None = None
-) -> tuple[Picture, Picture]:
+def overlay_pictures(result: PoseResult, scan: MeasuredScan, scene: Scene) -> tuple[Picture, ...]:
     """The two pictures of `overlay_before_after`, of the same size and from the same side."""
-    scene = scene or Scene(part)
-    reader = overlay_rotation(scan, part, result.part_from_camera)
+    reader = overlay_rotation(scan, scene.part, result.part_from_camera)
     some = scan.points[_choice(len(scan.points))]
     clouds = [pose.apply(some) for pose in (result.before, result.part_from_camera)]
     frame = scene.frame(reader, clouds)
     color = np.tile(to_rgb(SCAN), (len(some), 1))
-    before, after = (
+    return tuple(
         scene.draw(reader, cloud, color, frame=frame, part_color=CAD, pixels=600)
         for cloud in clouds
     )
-    return before, after
 
 
-def pose_picture(
-    scan: MeasuredScan,
-    part: Part,
-    part_from_camera: RigidTransform,
-    *,
-    scene: Scene | None = None,
-    pixels: int = 360,
-) -> Picture:
+def pose_picture(scan: MeasuredScan, scene: Scene, part_from_camera: RigidTransform) -> Picture:
     """The scan on the CAD model at any pose, a small picture for alternatives."""
-    scene = scene or Scene(part)
-    reader = overlay_rotation(scan, part, part_from_camera)
+    reader = overlay_rotation(scan, scene.part, part_from_camera)
     cloud = part_from_camera.apply(scan.points[_choice(len(scan.points))])
-    return scene.draw(
-        reader, cloud, np.tile(to_rgb(SCAN), (len(cloud), 1)),
-        frame=scene.frame(reader, [cloud]), part_color=CAD, pixels=pixels,
-    )  # fmt: skip
+    frame = scene.frame(reader, [cloud])
+    color = np.tile(to_rgb(SCAN), (len(cloud), 1))
+    return scene.draw(reader, cloud, color, frame=frame, part_color=CAD, pixels=360)
 
 
 def overlay_rotation(
@@ -234,9 +206,3 @@ def _choice(count: int) -> np.ndarray | slice:
     if count <= _MAX_DOTS:
         return slice(None)
     return np.random.default_rng(0).choice(count, _MAX_DOTS, replace=False)
-
-
-def _lift_mm(result: PoseResult) -> float:
-    """How far below the surface a point is still drawn on it: what noise alone may do."""
-    tolerance = result.verification.tolerance_mm
-    return tolerance if np.isfinite(tolerance) else 0.0

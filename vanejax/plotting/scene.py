@@ -16,8 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from vanejax.cad import Part
-from vanejax.plotting.canvas import INK, TICK_PT
-from vanejax.plotting.clouds import reader_direction
+from vanejax.plotting.clouds import draw_scale_bar, reader_direction
 from vanejax.plotting.shading import shade
 from vanejax.rigid import RigidTransform
 from vanejax.scanner import Camera, Scan, Scanner, look_at
@@ -58,6 +57,7 @@ class Scene:
     def __init__(self, part: Part) -> None:
         self.part = part
         self._scanner = Scanner(part)
+        self._reach_mm = _REACH * part.radius
         self._distance_mm = 1.05 * part.radius / np.sin(np.radians(_FIELD_DEG) / 2)
 
     def frame(self, reader_from_part: np.ndarray, clouds: list[np.ndarray]) -> np.ndarray:
@@ -69,7 +69,10 @@ class Scene:
         """
         pose = self._camera_from_part(reader_from_part)
         low_high = []
-        for points in (np.asarray(self.part.mesh.vertices), *map(self._near, clouds)):
+        for points in (
+            np.asarray(self.part.mesh.vertices),
+            *(cloud[self._near(cloud)] for cloud in clouds),
+        ):
             if len(points):
                 moved = pose.apply(points)
                 flat = self._distance_mm * moved[:, :2] / -moved[:, 2:]
@@ -103,7 +106,7 @@ class Scene:
         mm_per_pixel = float(np.max(frame[1] - frame[0])) / pixels
         half = np.ceil(np.abs(frame).max(axis=0) / mm_per_pixel).astype(int)
         fov = np.degrees(2 * np.arctan(half * mm_per_pixel / self._distance_mm))
-        reach = _REACH * self.part.radius
+        reach = self._reach_mm
         camera = Camera(
             width=int(2 * half[0]), height=int(2 * half[1]), fov_x_deg=fov[0], fov_y_deg=fov[1],
             near_mm=self._distance_mm - reach, far_mm=self._distance_mm + reach,
@@ -111,7 +114,7 @@ class Scene:
         pose = self._camera_from_part(reader_from_part)
         scan = self._scanner.scan(camera, pose)
         image, depth = _shaded_part(scan, camera, part_color)
-        near = np.linalg.norm(points - self.part.center, axis=1) < reach
+        near = self._near(points)
         _splat(image, depth, camera, pose.apply(points[near]), colors[near], lift_mm)
         first = np.floor(half + frame[0] / mm_per_pixel).astype(int)
         last = np.ceil(half + frame[1] / mm_per_pixel).astype(int)
@@ -128,9 +131,8 @@ class Scene:
         return RigidTransform(reader_from_part, back - reader_from_part @ self.part.center)
 
     def _near(self, points: np.ndarray) -> np.ndarray:
-        """Those of the points [N, 3] that are drawn."""
-        reach = _REACH * self.part.radius
-        return points[np.linalg.norm(points - self.part.center, axis=1) < reach]
+        """[N] bool: which of the points [N, 3] are drawn."""
+        return np.linalg.norm(points - self.part.center, axis=1) < self._reach_mm
 
 
 def reader_rotation(
@@ -167,13 +169,8 @@ def show(axes: Axes, picture: Picture) -> None:
     axes.imshow(picture.image, extent=picture.extent_mm, interpolation="antialiased")
     axes.set_axis_off()
     left, right, bottom, top = picture.extent_mm
-    length = scale_bar_mm(picture.width_mm)
-    x, y = left + 0.02 * (right - left), bottom - 0.02 * (top - bottom)
-    axes.plot([x, x + length], [y, y], color=INK, linewidth=1.5, solid_capstyle="butt")
-    axes.text(
-        x + length / 2, y - 0.012 * (top - bottom), f"{length:g} mm", color=INK, fontsize=TICK_PT,
-        ha="center", va="top",
-    )  # fmt: skip
+    y = bottom - 0.02 * (top - bottom)
+    draw_scale_bar(axes, scale_bar_mm(picture.width_mm), y, y - 0.012 * (top - bottom), "top")
     axes.set_xlim(left, right)
     axes.set_ylim(bottom - 0.09 * (top - bottom), top)
 

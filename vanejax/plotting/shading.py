@@ -66,13 +66,13 @@ def draw_part(axes: Axes, scan: Scan, camera: Camera, image: np.ndarray) -> None
     axes.set_axis_off()
 
 
-def crop(scan: Scan, camera: Camera, *, margin: float = 0.03) -> tuple[slice, slice]:
-    """Rows and columns of the image that show the part, with a margin as a share of its size."""
+def crop(scan: Scan, camera: Camera) -> tuple[slice, slice]:
+    """Rows and columns of the image that show the part, with a margin of 3 % of its size."""
     row, column = np.divmod(scan.pixel, camera.width)
     slices = []
     for index, size in ((row, camera.height), (column, camera.width)):
         low, high = int(index.min()), int(index.max()) + 1
-        pad = round(margin * (high - low)) + 1
+        pad = round(0.03 * (high - low)) + 1
         slices.append(slice(max(0, low - pad), min(size, high + pad)))
     return slices[0], slices[1]
 

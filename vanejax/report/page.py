@@ -103,7 +103,7 @@ def write_report(
 def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransform | None) -> str:
     """The page's text."""
     scene = Scene(part)
-    before, after = overlay_pictures(result, scan, part, scene=scene)
+    before, after = overlay_pictures(result, scan, scene)
     moved = _difference(result.before, result.part_from_camera, part.center)
     return templates.page(
         "page.html",
@@ -118,13 +118,13 @@ def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransf
         moved_mm=float(np.linalg.norm(moved[3:])),
         before=image(before),
         after=image(after),
-        deviations=[image(p) for p in deviation_pictures(result, scan, part, scene=scene)],
+        deviations=[image(p) for p in deviation_pictures(result, scan, scene)],
         lost=float(np.isnan(result.verification.deviation_mm).mean())
         if len(result.verification.deviation_mm)
         else 0.0,
         limit_mm=color_limit_mm(result.verification),
         histogram=figure_uris(residual_histogram(result)),
-        others=_others(result, scan, part, scene),
+        others=_others(result, scan, scene),
         truth=None if truth is None else _against_truth(result, truth),
         viewer=viewer(result, scan, part),
         total_seconds=sum(result.seconds.values()),
@@ -207,15 +207,13 @@ def _shares(result: PoseResult) -> list[dict[str, Any]]:
     return rows
 
 
-def _others(
-    result: PoseResult, scan: MeasuredScan, part: Part, scene: Scene
-) -> list[dict[str, Any]]:
+def _others(result: PoseResult, scan: MeasuredScan, scene: Scene) -> list[dict[str, Any]]:
     """The alternatives; the first few with a picture, each from beside its own sensor."""
     rows = []
     for alternative in result.alternatives:
         found = alternative.part_from_camera
         picture = None
         if len(rows) < _MOST_PICTURES:
-            picture = image(pose_picture(scan, part, found, scene=scene))
+            picture = image(pose_picture(scan, scene, found))
         rows.append({"alternative": alternative, "pose": _pose(found), "image": picture})
     return rows

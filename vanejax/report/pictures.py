@@ -54,9 +54,9 @@ def image(picture: Picture) -> Image:
     )
 
 
-def figure_uris(figure: Figure, *, dpi: int = 160) -> tuple[str, str]:
+def figure_uris(figure: Figure) -> tuple[str, str]:
     """A figure on nothing, with ink for a light and for a dark page; its colours are changed."""
-    light = _figure_uri(figure, dpi)
+    light = _figure_uri(figure)
     figure.set_layout_engine("none")  # the places stay as the first drawing found them
     for artist in figure.findobj():
         for name in ("color", "edgecolor", "markeredgecolor"):
@@ -65,18 +65,18 @@ def figure_uris(figure: Figure, *, dpi: int = 160) -> tuple[str, str]:
                 getattr(artist, f"set_{name}")(_ON_DARK[value])
     for axes in figure.axes:
         axes.tick_params(colors=_ON_DARK[INK])
-    return light, _figure_uri(figure, dpi)
+    return light, _figure_uri(figure)
 
 
-def color_bar(steps: int = 17) -> str:
+def color_bar() -> str:
     """The colours of deviations from low to high, as a CSS gradient."""
-    colors = colormaps[DEVIATION_COLORMAP](np.linspace(0, 1, steps))
+    colors = colormaps[DEVIATION_COLORMAP](np.linspace(0, 1, 17))
     return f"linear-gradient(to right, {', '.join(map(to_hex, colors))})"
 
 
-def _figure_uri(figure: Figure, dpi: int) -> str:
+def _figure_uri(figure: Figure) -> str:
     data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=dpi, transparent=True, metadata={"Software": None})
+    figure.savefig(data, format="png", dpi=160, transparent=True, metadata={"Software": None})
     return _png_uri(data.getvalue())
 
 
