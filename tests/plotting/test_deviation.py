@@ -15,12 +15,8 @@ from matplotlib.text import Text
 from vanejax.cad import part_from_mesh
 from vanejax.localization.pose_result import PointStatus
 from vanejax.plotting import deviation_map, overlay_before_after, residual_histogram
-from vanejax.plotting.deviation import (
-    NO_PARTNER,
-    color_limit_mm,
-    deviation_colors,
-    overlay_pictures,
-)
+from vanejax.plotting.canvas import NO_PARTNER
+from vanejax.plotting.deviation import color_limit_mm, deviation_colors, overlay_pictures
 from vanejax.plotting.scene import Picture, Scene, reader_rotation, scale_bar_mm
 from vanejax.rigid import RigidTransform
 from vanejax.scans import MeasuredScan
@@ -231,7 +227,9 @@ def test_a_histogram_without_noise_or_partners_is_drawn(noise):
 
 def test_before_and_after_have_one_frame_and_differ():
     case = example_registration()
-    before, after = overlay_pictures(case.result, case.scan, Scene(case.part))
+    before, after = overlay_pictures(
+        case.scan, Scene(case.part), case.result.before, case.result.part_from_camera
+    )
     assert before.extent_mm == after.extent_mm
     red, blue_ = (after.image[..., k] for k in (0, 2))
     solid = after.image[..., 3] == 1

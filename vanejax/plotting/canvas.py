@@ -93,6 +93,11 @@ def style_chart(axes: Axes, *, title: str = "", xlabel: str = "", ylabel: str = 
         axes.spines[side].set_color(FAINT)
 
 
+def name_panel(axes: Axes, title: str, **look: Any) -> None:
+    """A title over a panel."""
+    axes.set_title(title, **{"color": INK, "fontsize": LABEL_PT, **look})
+
+
 def add_legend(owner: Axes | Figure, handles: Sequence[Artist] | None = None, **place: Any) -> None:
     """A legend without a frame; of a figure's first panel if no handles are given."""
     if handles is None:

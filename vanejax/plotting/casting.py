@@ -9,17 +9,8 @@ from matplotlib.colors import Colormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 
 from vanejax.cad import Part
-from vanejax.plotting.canvas import (
-    DEVIATION_COLORMAP,
-    ERROR_COLORMAP,
-    FAINT,
-    INK,
-    LABEL_PT,
-    WIDTH_IN,
-    add_color_bar,
-    new_figure,
-)
-from vanejax.plotting.shading import crop, draw_part, shade
+from vanejax.plotting import canvas
+from vanejax.plotting.shading import crop_size, draw_part, shade
 from vanejax.scanner import Camera, Scan, Scanner, hemisphere_viewpoints
 
 _PIXELS = 900
@@ -53,22 +44,22 @@ def casting_map(part: Part, cast: Part) -> Figure:
         scans.append(scanner.scan(camera, view))
     offsets = [_offset_mm(scan, bare) for scan in scans]
     scale, colors = _scale(np.concatenate(offsets))
-    crops = (crop(scan, camera) for scan in scans)
-    widths = [(across.stop - across.start) / (down.stop - down.start) for down, across in crops]
-    figure = new_figure(WIDTH_IN, (WIDTH_IN - 0.9) / sum(widths) + 0.3)
+    sizes = [crop_size(scan, camera) for scan in scans]
+    widths = [wide / high for wide, high in sizes]
+    figure = canvas.new_figure(canvas.WIDTH_IN, (canvas.WIDTH_IN - 0.9) / sum(widths) + 0.3)
     panels = figure.subplots(1, 2, width_ratios=widths)
     for axes, title, scan, offset in zip(panels, _SIDES_DEG, scans, offsets, strict=True):
         image = shade(scan, camera)
         light = image.reshape(-1, 3)[scan.pixel].mean(axis=1, keepdims=True)
         color = colors(scale(offset))[:, :3]
-        color[np.isnan(offset)] = to_rgb(FAINT)
+        color[np.isnan(offset)] = to_rgb(canvas.FAINT)
         # the surface's light keeps its shape readable
         bright = np.clip(light / np.percentile(light, 80), 0, 1)
         image.reshape(-1, 3)[scan.pixel] = color * (0.55 + 0.45 * bright)
         draw_part(axes, scan, camera, image)
-        axes.set_title(title, color=INK, fontsize=LABEL_PT)
+        canvas.name_panel(axes, title)
     label = "offset from the CAD surface (mm), + outward"
-    add_color_bar(
+    canvas.add_color_bar(
         figure, panels, ScalarMappable(scale, colors), label, fraction=0.025, extend="both"
     )
     return figure
@@ -91,5 +82,5 @@ def _scale(offset: np.ndarray) -> tuple[Normalize, Colormap]:
     low, high = low - 0.005, high + 0.005  # a uniform offset has a scale too
     if low < -0.01:
         limit = max(-low, high)
-        return Normalize(-limit, limit), colormaps[DEVIATION_COLORMAP]
-    return Normalize(low, high), colormaps[ERROR_COLORMAP]
+        return Normalize(-limit, limit), colormaps[canvas.DEVIATION_COLORMAP]
+    return Normalize(low, high), colormaps[canvas.ERROR_COLORMAP]

@@ -18,13 +18,13 @@ from vanejax.plotting.canvas import (
     FAINT,
     HIDDEN,
     INK,
-    LABEL_PT,
     SCAN,
     TICK_PT,
     TITLE_PT,
     WIDTH_IN,
     add_color_bar,
     name_colors,
+    name_panel,
     new_figure,
 )
 from vanejax.pointcloud import voxel_thin
@@ -101,8 +101,8 @@ def registration_overlays(overlays: Sequence[Overlay]) -> Figure:
             draw_dots(axes, overlay_dots(source, overlay.reference, width), limit)
         view = view_name(overlay.elevation_deg, overlay.azimuth_deg).replace(", ", "\n")
         title = f"{view}\n{100 * overlay.visible_fraction:.0f} % visible"
-        before.set_title(title, color=INK, fontsize=TICK_PT)
-        after.set_title(overlay.error, color=INK, fontsize=TICK_PT, fontweight="bold")
+        name_panel(before, title, fontsize=TICK_PT)
+        name_panel(after, overlay.error, fontsize=TICK_PT, fontweight="bold")
     for axes, name in zip(rows[:, 0], ("before", "after"), strict=True):
         axes.text(
             0.0, 0.5, name, transform=axes.transAxes, rotation=90, ha="right", va="center",
@@ -144,7 +144,7 @@ def method_displacements(overlays: Mapping[str, Overlay], *, columns: int = 4) -
         color = scale.to_rgba(np.nan_to_num(displacement))[:, :3]
         cloud = Dots(overlay.moved, color, 9.0 * (width / 2) ** 2)
         draw_dots(axes, [Dots(overlay.reference, FAINT, 1.5 * (width / 2) ** 2), cloud], limit)
-        axes.set_title(f"{name}\n{overlay.error}", color=INK, fontsize=LABEL_PT)
+        name_panel(axes, f"{name}\n{overlay.error}")
     _scale_bar(panels[0, 0])
     add_color_bar(figure, panels, scale, "distance of each point from its true place (mm)",
                   shrink=0.6, aspect=30, extend="both")  # fmt: skip
@@ -179,7 +179,7 @@ def view_and_shadow(
         axes.set_axis_off()
     for axes, clouds, name in zip(panels, pictures, names, strict=False):
         draw_dots(axes, view_dots(*clouds, width), limit)
-        axes.set_title(name, color=INK, fontsize=LABEL_PT)
+        name_panel(axes, name)
     _scale_bar(panels[0])
     name_colors(figure, {"seen by the camera": SCAN, "hidden by self-occlusion": HIDDEN})
     return figure

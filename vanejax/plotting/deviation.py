@@ -10,29 +10,16 @@ from matplotlib.figure import Figure
 
 from vanejax.cad import Part
 from vanejax.localization.pose_result import PointStatus, PoseResult, Verification
-from vanejax.plotting.canvas import (
-    CAD,
-    DEVIATION_COLORMAP,
-    INK,
-    LABEL_PT,
-    NO_PARTNER,
-    SCAN,
-    WIDTH_IN,
-    add_color_bar,
-    add_legend,
-    name_colors,
-    new_figure,
-    style_chart,
-)
+from vanejax.plotting import canvas
 from vanejax.plotting.scene import Picture, Scene, reader_rotation, show
 from vanejax.rigid import RigidTransform
 from vanejax.scans import MeasuredScan
 
 STATUS_COLORS = {
-    PointStatus.INLIER: SCAN,
+    PointStatus.INLIER: canvas.SCAN,
     PointStatus.BEFORE: "#cc79a7",
     PointStatus.BEHIND: "#8c2d04",
-    PointStatus.BESIDE: NO_PARTNER,
+    PointStatus.BESIDE: canvas.NO_PARTNER,
 }
 # the second look on the same scan: far enough round to see what the first one foreshortens
 OBLIQUE_YAW_DEG, OBLIQUE_PITCH_DEG = 48.0, 18.0
@@ -52,21 +39,21 @@ def deviation_map(result: PoseResult, scan: MeasuredScan, part: Part) -> Figure:
     limit = color_limit_mm(result.verification)
     mm_per_in = sum(picture.width_mm for picture in pictures) / (2 * _PANEL_IN)
     high = max(picture.width_mm * picture.height_per_width for picture in pictures) / mm_per_in
-    figure = new_figure(WIDTH_IN, high + 0.6)
+    figure = canvas.new_figure(canvas.WIDTH_IN, high + 0.6)
     # one scale for both
     panels = figure.subplots(1, 2, width_ratios=[picture.width_mm for picture in pictures])
     for axes, picture, title in zip(
         panels, pictures, ("from the sensor's side", "from further left and above"), strict=True
     ):
         show(axes, picture)
-        axes.set_title(title, color=INK, fontsize=LABEL_PT)
-    scale = ScalarMappable(Normalize(-limit, limit), colormaps[DEVIATION_COLORMAP])
+        canvas.name_panel(axes, title)
+    scale = ScalarMappable(Normalize(-limit, limit), colormaps[canvas.DEVIATION_COLORMAP])
     label = "deviation from the CAD surface (mm)\n+ outside the material"
-    add_color_bar(figure, panels, scale, label, fraction=0.025, extend="both")
+    canvas.add_color_bar(figure, panels, scale, label, fraction=0.025, extend="both")
     lost = np.count_nonzero(np.isnan(result.verification.deviation_mm))
     if lost:
         share = 100 * lost / len(result.verification.deviation_mm)
-        name_colors(figure, {f"no partner on the part ({share:.1f} %)": NO_PARTNER})
+        canvas.name_colors(figure, {f"no partner on the part ({share:.1f} %)": canvas.NO_PARTNER})
     return figure
 
 
@@ -82,9 +69,9 @@ def residual_histogram(result: PoseResult) -> Figure:
     status = verification.status[finite]
     limit = float(np.fmax(1.6 * verification.tolerance_mm, color_limit_mm(verification)))
     edges = np.linspace(-limit, limit, 97)
-    figure = new_figure(5.0, 2.9)
+    figure = canvas.new_figure(5.0, 2.9)
     axes = figure.subplots()
-    style_chart(axes, xlabel="deviation from the CAD surface (mm)", ylabel="points")
+    canvas.style_chart(axes, xlabel="deviation from the CAD surface (mm)", ylabel="points")
     shown = [s for s in PointStatus if (status == s).any()]
     if shown:
         axes.hist(
@@ -97,21 +84,21 @@ def residual_histogram(result: PoseResult) -> Figure:
         x = np.linspace(-limit, limit, 401)
         density = np.exp(-0.5 * (x / noise) ** 2) / (noise * np.sqrt(2 * np.pi))
         axes.plot(
-            x, inliers * (edges[1] - edges[0]) * density, color=INK, linewidth=1.4,
+            x, inliers * (edges[1] - edges[0]) * density, color=canvas.INK, linewidth=1.4,
             label=f"noise, σ = {noise:.3g} mm",
         )  # fmt: skip
     if np.isfinite(verification.tolerance_mm):
         for sign, label in ((-1, "tolerance"), (1, "_nolegend_")):
             edge = sign * verification.tolerance_mm
-            axes.axvline(edge, color=INK, linewidth=1, linestyle=(0, (4, 3)), label=label)
+            axes.axvline(edge, color=canvas.INK, linewidth=1, linestyle=(0, (4, 3)), label=label)
     beyond = np.count_nonzero(np.abs(deviation) > limit)
     if beyond:
         words = f"{beyond:,} points lie beyond ±{limit:.3g} mm"
-        axes.set_title(words, color=INK, fontsize=LABEL_PT, loc="right")
+        canvas.name_panel(axes, words, loc="right")
     axes.set_xlim(-limit, limit)
     entries = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
     order = dict.fromkeys([*(s.name.lower() for s in shown), *entries])
-    add_legend(
+    canvas.add_legend(
         figure, [entries[name] for name in order], loc="outside upper center", ncols=6,
         handlelength=1.4, columnspacing=1.2,
     )  # fmt: skip
@@ -126,14 +113,16 @@ def overlay_before_after(result: PoseResult, scan: MeasuredScan, part: Part) -> 
       scan: of more than 100,000 points a random choice is drawn.
       part: to what it was registered.
     """
-    pictures = overlay_pictures(result, scan, Scene(part))
-    figure = new_figure(WIDTH_IN, WIDTH_IN / 2 * pictures[0].height_per_width + 0.6)
+    pictures = overlay_pictures(scan, Scene(part), result.before, result.part_from_camera)
+    figure = canvas.new_figure(
+        canvas.WIDTH_IN, canvas.WIDTH_IN / 2 * pictures[0].height_per_width + 0.6
+    )
     for axes, picture, title in zip(
         figure.subplots(1, 2), pictures, ("before", "after"), strict=True
     ):
         show(axes, picture)
-        axes.set_title(title, color=INK, fontsize=LABEL_PT, fontweight="bold")
-    name_colors(figure, {"scan": SCAN, "CAD": CAD})
+        canvas.name_panel(axes, title, fontweight="bold")
+    canvas.name_colors(figure, {"scan": canvas.SCAN, "CAD": canvas.CAD})
     return figure
 
 
@@ -150,8 +139,10 @@ def color_limit_mm(verification: Verification) -> float:
 
 def deviation_colors(deviation_mm: np.ndarray, limit_mm: float) -> np.ndarray:
     """Colours [n, 3], 0 to 1, of signed deviations [n] in mm; NaN has a colour of its own."""
-    colors = colormaps[DEVIATION_COLORMAP](Normalize(-limit_mm, limit_mm)(deviation_mm))[:, :3]
-    colors[np.isnan(deviation_mm)] = to_rgb(NO_PARTNER)
+    colors = colormaps[canvas.DEVIATION_COLORMAP](Normalize(-limit_mm, limit_mm)(deviation_mm))[
+        :, :3
+    ]
+    colors[np.isnan(deviation_mm)] = to_rgb(canvas.NO_PARTNER)
     return colors
 
 
@@ -172,26 +163,22 @@ def deviation_pictures(result: PoseResult, scan: MeasuredScan, scene: Scene) -> 
     return tuple(pictures)
 
 
-def overlay_pictures(result: PoseResult, scan: MeasuredScan, scene: Scene) -> tuple[Picture, ...]:
-    """The two pictures of `overlay_before_after`, of the same size and from the same side."""
-    reader = overlay_rotation(scan, scene.part, result.part_from_camera)
+def overlay_pictures(
+    scan: MeasuredScan, scene: Scene, *poses: RigidTransform, pixels: int = 600
+) -> list[Picture]:
+    """The scan on the CAD model at poses part_from_camera, from one side, that of the last pose.
+
+    All pictures have the same size; ``pixels`` is their longer side.
+    """
+    reader = overlay_rotation(scan, scene.part, poses[-1])
     some = scan.points[_choice(len(scan.points))]
-    clouds = [pose.apply(some) for pose in (result.before, result.part_from_camera)]
+    clouds = [pose.apply(some) for pose in poses]
     frame = scene.frame(reader, clouds)
-    color = np.tile(to_rgb(SCAN), (len(some), 1))
-    return tuple(
-        scene.draw(reader, cloud, color, frame=frame, part_color=CAD, pixels=600)
+    color = np.tile(to_rgb(canvas.SCAN), (len(some), 1))
+    return [
+        scene.draw(reader, cloud, color, frame=frame, part_color=canvas.CAD, pixels=pixels)
         for cloud in clouds
-    )
-
-
-def pose_picture(scan: MeasuredScan, scene: Scene, part_from_camera: RigidTransform) -> Picture:
-    """The scan on the CAD model at any pose, a small picture for alternatives."""
-    reader = overlay_rotation(scan, scene.part, part_from_camera)
-    cloud = part_from_camera.apply(scan.points[_choice(len(scan.points))])
-    frame = scene.frame(reader, [cloud])
-    color = np.tile(to_rgb(SCAN), (len(cloud), 1))
-    return scene.draw(reader, cloud, color, frame=frame, part_color=CAD, pixels=360)
+    ]
 
 
 def overlay_rotation(

@@ -11,7 +11,7 @@ from matplotlib.animation import FuncAnimation
 from scipy.spatial.transform import Rotation, Slerp
 
 from vanejax.errors import InputError
-from vanejax.plotting.canvas import CAD, INK, LABEL_PT, SCAN, name_colors, new_figure
+from vanejax.plotting.canvas import CAD, SCAN, name_colors, name_panel, new_figure
 from vanejax.plotting.clouds import draw_dots, height_per_width, limits, overlay_dots
 from vanejax.rigid import RigidTransform
 
@@ -67,7 +67,7 @@ def registration_film(
     def draw(frame: int) -> list:
         axes.clear()
         draw_dots(axes, overlay_dots(clouds[frame], reference, 2.0), limit)
-        axes.set_title(names[frame // frames_per_pose], color=INK, fontsize=LABEL_PT)
+        name_panel(axes, names[frame // frames_per_pose])
         return []
 
     with rc_context({"animation.embed_limit": 50.0}):

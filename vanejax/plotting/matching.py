@@ -14,17 +14,7 @@ from matplotlib.lines import Line2D
 from scipy.spatial.distance import cdist
 
 from vanejax.errors import InputError
-from vanejax.plotting.canvas import (
-    CAD,
-    INK,
-    LABEL_PT,
-    RIGHT,
-    SCAN,
-    WIDTH_IN,
-    WRONG,
-    add_legend,
-    new_figure,
-)
+from vanejax.plotting import canvas
 from vanejax.plotting.clouds import draw_dots, flattened, height_per_width, limits, overlay_dots
 
 _GAP = 1.12  # of the width of what is drawn: how far the scan is moved aside
@@ -92,8 +82,8 @@ def matching_lines(
     limit[0, 1] += 0.06 * (limit[1, 0] - limit[0, 0])  # no scale bar here
     lines = {title: _strongest(matching, points, partners) for title, matching in matchings.items()}
     opaque = max([weight.max() for _, _, weight in lines.values() if len(weight)], default=1.0)
-    width = WIDTH_IN / max(2, len(matchings))
-    figure = new_figure(width * len(matchings), width * height_per_width(limit) + 1.3)
+    width = canvas.WIDTH_IN / max(2, len(matchings))
+    figure = canvas.new_figure(width * len(matchings), width * height_per_width(limit) + 1.3)
     for axes, (title, matching) in zip(
         figure.subplots(1, len(matchings), squeeze=False)[0], matchings.items(), strict=True
     ):
@@ -104,19 +94,20 @@ def matching_lines(
         _draw_lines(axes, ends, right, np.sqrt(weight / opaque))
         share = matching.right_share(within_mm)
         quality = f"{100 * share:.0f} % of the weight within {within_mm:g} mm"
-        axes.set_title(
+        canvas.name_panel(
+            axes,
             f"{title}\n{quality if np.isfinite(share) else 'nothing is matched'}\n"
             f"strongest weight {weight.max(initial=0.0):.2g}",
-            color=INK,
-            fontsize=LABEL_PT,
         )
     entries = [
-        Line2D([], [], marker="o", linestyle="", color=SCAN, label="scan, moved aside"),
-        Line2D([], [], marker="o", linestyle="", color=CAD, label="CAD"),
-        Line2D([], [], color=RIGHT, label="right match"),
-        Line2D([], [], color=WRONG, label="wrong match"),
+        Line2D([], [], marker="o", linestyle="", color=canvas.SCAN, label="scan, moved aside"),
+        Line2D([], [], marker="o", linestyle="", color=canvas.CAD, label="CAD"),
+        Line2D([], [], color=canvas.RIGHT, label="right match"),
+        Line2D([], [], color=canvas.WRONG, label="wrong match"),
     ]
-    add_legend(figure, entries, loc="outside lower center", ncols=4 if len(matchings) > 1 else 2)
+    canvas.add_legend(
+        figure, entries, loc="outside lower center", ncols=4 if len(matchings) > 1 else 2
+    )
     return figure
 
 
@@ -145,7 +136,7 @@ def _strongest(
 
 def _draw_lines(axes: Axes, ends: np.ndarray, right: np.ndarray, opacity: np.ndarray) -> None:
     """Lines between ends [L, 2, 3] into axes, below the dots; ``right`` [L], ``opacity`` [L]."""
-    colors = np.where(right[:, None], to_rgb(RIGHT), to_rgb(WRONG))
+    colors = np.where(right[:, None], to_rgb(canvas.RIGHT), to_rgb(canvas.WRONG))
     flat = flattened(ends.reshape(-1, 3))[:, :2].reshape(-1, 2, 2)
     axes.add_collection(
         LineCollection(

@@ -29,7 +29,7 @@ from vanejax.plotting.clouds import (
     seen_and_hidden,
     view_dots,
 )
-from vanejax.plotting.shading import crop, draw_part, shade
+from vanejax.plotting.shading import crop_size, draw_part, shade
 from vanejax.scanner import Camera, Scan
 
 _GAP_IN = 0.3
@@ -44,8 +44,7 @@ def overview_picture(portrait: Scan, camera: Camera, scan: Scan, overlay: Overla
       scan: the view that is registered, with `Scan.hidden`.
       overlay: its registration.
     """
-    rows, columns = crop(portrait, camera)
-    wide, high = (columns.stop - columns.start) / camera.fx, (rows.stop - rows.start) / camera.fy
+    wide, high = crop_size(portrait, camera)
     view = seen_and_hidden(scan, voxel_mm=1.0)
     frames = [limits(view), *(limits([c, overlay.reference])
                               for c in (overlay.source, overlay.moved))]  # fmt: skip

@@ -7,22 +7,13 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from vanejax.errors import InputError
-from vanejax.plotting.canvas import (
-    CLUTTER,
-    INK,
-    LABEL_PT,
-    SCAN,
-    TABLE,
-    WIDTH_IN,
-    name_colors,
-    new_figure,
-)
+from vanejax.plotting import canvas
 from vanejax.plotting.shading import shade
 from vanejax.scanner import Camera, Scan
 from vanejax.scanner.clutter import ClutterScene
 from vanejax.scans import Segment, Segments
 
-_COLORS = {Segment.PART: SCAN, Segment.TABLE: TABLE, Segment.OTHER: CLUTTER}
+_COLORS = {Segment.PART: canvas.SCAN, Segment.TABLE: canvas.TABLE, Segment.OTHER: canvas.CLUTTER}
 _NAMES = {Segment.PART: "part", Segment.TABLE: "table", Segment.OTHER: "clutter"}
 
 
@@ -49,7 +40,9 @@ def segments_picture(scan: Scan, camera: Camera, scene: ClutterScene, segments: 
     truth = np.array(kinds, np.uint8)[owner]
     light = shade(scan, camera)
     aspect = camera.fx / camera.fy
-    figure = new_figure(WIDTH_IN, WIDTH_IN / 2 * aspect * camera.height / camera.width + 0.6)
+    figure = canvas.new_figure(
+        canvas.WIDTH_IN, canvas.WIDTH_IN / 2 * aspect * camera.height / camera.width + 0.6
+    )
     wrong = float(np.mean(segments.label != truth))
     for axes, label, title in zip(
         figure.subplots(1, 2),
@@ -60,9 +53,9 @@ def segments_picture(scan: Scan, camera: Camera, scene: ClutterScene, segments: 
         image = _colored(light, scan, camera, label)
         axes.imshow(image, aspect=aspect, interpolation="antialiased")
         axes.set_axis_off()
-        axes.set_title(title, color=INK, fontsize=LABEL_PT)
+        canvas.name_panel(axes, title)
     present = [s for s in Segment if np.any(truth == s) or np.any(segments.label == s)]
-    name_colors(figure, {_NAMES[s]: _COLORS[s] for s in present})
+    canvas.name_colors(figure, {_NAMES[s]: _COLORS[s] for s in present})
     return figure
 
 

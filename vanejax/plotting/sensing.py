@@ -12,20 +12,12 @@ from matplotlib.colors import Normalize, SymLogNorm, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from vanejax.plotting.canvas import (
-    DEVIATION_COLORMAP,
-    INK,
-    LABEL_PT,
-    WIDTH_IN,
-    add_color_bar,
-    add_legend,
-    new_figure,
-)
-from vanejax.plotting.shading import crop
+from vanejax.plotting import canvas
+from vanejax.plotting.shading import crop_size, draw_part
 from vanejax.scanner import Measurement, Reason
 
 REASON_COLORS = {
-    Reason.SHADOWED: INK,
+    Reason.SHADOWED: canvas.INK,
     Reason.GRAZING: "#882255",
     Reason.SATURATED: "#e3c800",
     Reason.DARK: "#6b8e00",
@@ -47,28 +39,20 @@ def measurements_picture(
     columns = min(columns, len(measurements))
     lines = -(-len(measurements) // columns)
     first = next(iter(measurements.values()))
-    camera = first.sensor.camera
-    down, across = crop(first.ideal, camera)
-    high = (down.stop - down.start) / camera.fy / ((across.stop - across.start) / camera.fx)
-    width = (WIDTH_IN - 0.8) / columns
-    figure = new_figure(width * columns + 0.8, (width * high + 0.35) * lines + 0.3)
+    wide, high = crop_size(first.ideal, first.sensor.camera)
+    width = (canvas.WIDTH_IN - 0.8) / columns
+    figure = canvas.new_figure(width * columns + 0.8, (width * high / wide + 0.35) * lines + 0.3)
     panels = figure.subplots(lines, columns, squeeze=False)
     scale = SymLogNorm(LINEAR_MM, vmin=-limit_mm, vmax=limit_mm)
     for axes in panels.flat:
         axes.set_axis_off()
     for axes, (title, measurement) in zip(panels.flat, measurements.items(), strict=False):
-        rows, across = crop(measurement.ideal, measurement.sensor.camera)
-        axes.imshow(
-            error_image(measurement, scale)[rows, across],
-            aspect=measurement.sensor.camera.fx / measurement.sensor.camera.fy,
-            interpolation="antialiased",
-        )
-        axes.set_title(
-            f"{title}\n{_figures(measurement)}", color=INK, fontsize=LABEL_PT, loc="left"
-        )
+        camera, image = measurement.sensor.camera, error_image(measurement, scale)
+        draw_part(axes, measurement.ideal, camera, image)
+        canvas.name_panel(axes, f"{title}\n{_figures(measurement)}", loc="left")
     label = "distance from the true surface (mm), + outward"
-    colors = ScalarMappable(scale, DEVIATION_COLORMAP)
-    bar = add_color_bar(figure, panels, colors, label, shrink=0.7, aspect=35)
+    colors = ScalarMappable(scale, canvas.DEVIATION_COLORMAP)
+    bar = canvas.add_color_bar(figure, panels, colors, label, shrink=0.7, aspect=35)
     bar.ax.yaxis.set_major_formatter("{x:g}")
     seen = {Reason(reason) for m in measurements.values() for reason in np.unique(m.reason)}
     handles = [
@@ -81,8 +65,8 @@ def measurements_picture(
         place: dict[str, Any] = {"loc": "center"}
         if not blank:
             place = {"loc": "outside lower center", "ncols": len(handles)}
-        add_legend(panels.flat[-1] if blank else figure, handles, title="not measured",
-                   title_fontsize=LABEL_PT, **place)  # fmt: skip
+        canvas.add_legend(panels.flat[-1] if blank else figure, handles, title="not measured",
+                   title_fontsize=canvas.LABEL_PT, **place)  # fmt: skip
     return figure
 
 
@@ -99,7 +83,9 @@ def error_image(measurement: Measurement, scale: Normalize) -> np.ndarray:
     reason = measurement.organised()["reason"]
     image = np.ones((*reason.shape, 3))
     measured = reason == Reason.MEASURED
-    image[measured] = colormaps[DEVIATION_COLORMAP](scale(off_surface_mm(measurement)))[:, :3]
+    image[measured] = colormaps[canvas.DEVIATION_COLORMAP](scale(off_surface_mm(measurement)))[
+        :, :3
+    ]
     for why, color in REASON_COLORS.items():
         image[reason == why] = to_rgb(color)
     return image

@@ -15,6 +15,9 @@ _BACKGROUND = np.array([1.0, 1.0, 1.0])
 # over the photographer's left shoulder, and a weak one from the right; camera frame
 _KEY_LIGHT = np.array([-0.45, 0.55, 0.70])
 _FILL_LIGHT = np.array([0.80, -0.10, 0.60])
+# where creases are looked for: pixels away, and in which directions
+_REACHES = (2, 5, 11)
+_AROUND = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
 
 
 def shade(scan: Scan, camera: Camera) -> np.ndarray:
@@ -50,9 +53,7 @@ def shade(scan: Scan, camera: Camera) -> np.ndarray:
 def part_picture(scan: Scan, camera: Camera) -> Figure:
     """The shaded part alone, cropped to what the camera that made the scan sees of it."""
     image = shade(scan, camera)
-    rows, columns = crop(scan, camera)
-    wide = (columns.stop - columns.start) / camera.fx
-    high = (rows.stop - rows.start) / camera.fy
+    wide, high = crop_size(scan, camera)
     longest = 5.0 / max(high, wide)
     figure = new_figure(longest * wide, longest * high)
     draw_part(figure.subplots(), scan, camera, image)
@@ -77,6 +78,12 @@ def crop(scan: Scan, camera: Camera) -> tuple[slice, slice]:
     return slices[0], slices[1]
 
 
+def crop_size(scan: Scan, camera: Camera) -> tuple[float, float]:
+    """Width and height of what `crop` leaves, in true proportions."""
+    rows, columns = crop(scan, camera)
+    return (columns.stop - columns.start) / camera.fx, (rows.stop - rows.start) / camera.fy
+
+
 def _creases(depth: np.ndarray) -> np.ndarray:
     """Factors in 0 to 1 that darken pixels behind their neighbours: [H, W] of depths, inf outside.
 
@@ -84,21 +91,13 @@ def _creases(depth: np.ndarray) -> np.ndarray:
     count: it is behind everything.
     """
     logarithm = np.log(depth)
+    padded = np.pad(logarithm, max(_REACHES), constant_values=np.inf)
     total = np.zeros_like(depth)
-    count = 0
-    for reach in (2, 5, 11):
-        for dy, dx in ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)):
-            neighbor = _shift(logarithm, reach * dy, reach * dx)
+    for reach in _REACHES:
+        for dy, dx in _AROUND:
+            y, x = max(_REACHES) + reach * dy, max(_REACHES) + reach * dx
+            neighbor = padded[y : y + depth.shape[0], x : x + depth.shape[1]]
             with np.errstate(invalid="ignore"):
                 behind = logarithm - neighbor
             total += np.clip(np.nan_to_num(behind, nan=0.0, posinf=0.0, neginf=0.0), 0, 0.02)
-            count += 1
-    return np.exp(-60.0 * total / count)
-
-
-def _shift(values: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """values[i + rows, j + columns], inf outside of the image."""
-    height, width = values.shape
-    pad = max(abs(rows), abs(columns))
-    padded = np.pad(values, pad, constant_values=np.inf)
-    return padded[pad + rows : pad + rows + height, pad + columns : pad + columns + width]
+    return np.exp(-60.0 * total / (len(_REACHES) * len(_AROUND)))

@@ -23,7 +23,6 @@ from vanejax.plotting.deviation import (
     color_limit_mm,
     deviation_pictures,
     overlay_pictures,
-    pose_picture,
     residual_histogram,
 )
 from vanejax.plotting.scene import Scene
@@ -103,7 +102,7 @@ def write_report(
 def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransform | None) -> str:
     """The page's text."""
     scene = Scene(part)
-    before, after = overlay_pictures(result, scan, scene)
+    before, after = overlay_pictures(scan, scene, result.before, result.part_from_camera)
     moved = _difference(result.before, result.part_from_camera, part.center)
     return templates.page(
         "page.html",
@@ -214,6 +213,7 @@ def _others(result: PoseResult, scan: MeasuredScan, scene: Scene) -> list[dict[s
         found = alternative.part_from_camera
         picture = None
         if len(rows) < _MOST_PICTURES:
-            picture = image(pose_picture(scan, scene, found))
+            (small,) = overlay_pictures(scan, scene, found, pixels=360)
+            picture = image(small)
         rows.append({"alternative": alternative, "pose": _pose(found), "image": picture})
     return rows
