@@ -1,8 +1,8 @@
-"""The PyTorch peer computes what RPM-Net does: vanejax's numbers, the published ones, its loss."""
+"""The PyTorch peer computes what RPM-Net does; vanejax is held to the published code elsewhere."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import copy
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import pytest
 from experiments.benchmarks.flops import dense_flops, feature_flops, match_flops
 from vanejax.matching import RpmNet
 from vanejax.matching.se3 import exp_so3
-from vanejax.matching.torch_weights import load_state_dict, rpmnet_variables
+from vanejax.matching.torch_weights import rpmnet_variables
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.training import Pair, RpmNetLoss
@@ -22,7 +22,6 @@ torch = pytest.importorskip("torch")
 from experiments.benchmarks import torch_rpmnet  # noqa: E402
 from experiments.benchmarks.torch_rpmnet import TorchRpmNet  # noqa: E402
 
-PARITY = Path(__file__).parents[4] / "shared" / "parity"
 N, M, K = 60, 70, 8
 
 
@@ -73,35 +72,27 @@ def test_it_finds_what_vanejax_finds(peer: TorchRpmNet, variables: dict, clouds)
 
 
 @pytest.mark.slow
-def test_its_loss_and_gradient_are_those_of_vanejax(
+def test_a_step_has_the_loss_and_gradient_of_vanejax(
     peer: TorchRpmNet, variables: dict, clouds
 ) -> None:
     source, target = clouds
     truth = RigidTransform(exp_so3(np.float32([0.0, 0.1, 0.0])), np.float32([0.0, 0.0, 0.1]))
     matrix = np.asarray(truth.as_matrix())[:3]
-    value = torch_rpmnet.loss(peer, *(torch.tensor(c[None]) for c in (source, target, matrix)), 2)
-    peer.zero_grad()
-    value.backward()
+    stepped = copy.deepcopy(peer)
+    step = torch_rpmnet.make_train_step(stepped, iterations=2)
+    loss = step(*(torch.tensor(c[None]) for c in (source, target, matrix)))
     batch = jax.tree.map(lambda leaf: leaf[None], (cloud(source), truth))
     pairs = Pair(source=batch[0], target=cloud(target), target_from_source=batch[1])
     model = RpmNet(num_neighbors=K, radius=0.5)
     value_and_grad = jax.value_and_grad(lambda given: RpmNetLoss()(model, given, pairs)[0])
     expected, gradient = jax.jit(value_and_grad)(variables)
-    np.testing.assert_allclose(value.item(), expected, rtol=1e-4)
-    theirs = peer.weights_net.postpool[6].bias.grad
+    np.testing.assert_allclose(loss, expected, rtol=1e-4)
+    bias = stepped.weights_net.postpool[6].bias
     ours = gradient["params"]["annealing_net"]["postpool_2"]["bias"]
-    np.testing.assert_allclose(theirs, ours, rtol=0.02)
-
-
-@pytest.mark.slow
-def test_a_step_makes_the_loss_smaller(clouds) -> None:
-    torch.manual_seed(1)
-    model = TorchRpmNet(num_neighbors=K, radius=0.5)
-    step = torch_rpmnet.make_train_step(model, iterations=2, learning_rate=1e-3)
-    batch = [torch.tensor(c[None]) for c in clouds]
-    truth = torch.eye(4)[None, :3]
-    losses = [step(*batch, truth) for _ in range(8)]
-    assert losses[-1] < losses[0]
+    np.testing.assert_allclose(bias.grad, ours, rtol=0.02)
+    # Adam's first step is the learning rate against the gradient's sign
+    moved = (bias - peer.weights_net.postpool[6].bias).detach()
+    np.testing.assert_allclose(moved, -1e-4 * np.sign(ours), rtol=0.2)
 
 
 def test_the_flops_are_those_that_pytorch_counts(peer: TorchRpmNet, clouds) -> None:
@@ -115,26 +106,3 @@ def test_the_flops_are_those_that_pytorch_counts(peer: TorchRpmNet, clouds) -> N
     small = 2 * 2 * (3 * N**2 + 3 * M**2) + 2 * dense_flops(N, (3, 3, 3, 3))
     total = counter.get_total_flops()
     assert 2 * each <= total <= 2 * each + 1.1 * small
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(
-    not (PARITY / "rpmnet_io.npz").exists(), reason="needs ../shared/parity/rpmnet_*.npz"
-)
-def test_parity_with_the_published_code() -> None:
-    with np.load(PARITY / "rpmnet_io.npz") as file:
-        io = dict(file)
-    model = TorchRpmNet(
-        num_neighbors=int(io["num_neighbors"]),
-        radius=float(io["radius"]),
-        sinkhorn_iterations=int(io["num_sinkhorn_iterations"]),
-    )
-    weights = load_state_dict(PARITY / "rpmnet_weights.npz")
-    model.load_state_dict({name: torch.tensor(value) for name, value in weights.items()})
-    points = [torch.tensor(io[name]) for name in ("points_src", "points_ref")]
-    with torch.no_grad():
-        motions, assignments = model(*points, 5)
-    np.testing.assert_allclose(np.stack(motions), io["transforms"], atol=1e-4)
-    sums = np.stack([a.sum(2) for a in assignments])
-    # of the one point that has a neighbour on the rim of the ball; see test_rpmnet
-    np.testing.assert_allclose(sums, io["src_weights"], atol=4e-3)
