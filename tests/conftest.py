@@ -6,5 +6,12 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ["VANEJAX_CACHE_DIR"] = "off"  # a test compiles what it tests
 
 import jax
+import pytest
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture
+def double_precision():
+    with jax.enable_x64(True):
+        yield

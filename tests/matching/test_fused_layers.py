@@ -12,20 +12,13 @@ from vanejax.matching.fused_layers import (
     DenseNormRelu,
     DenseNormReluCloudMax,
     DenseNormReluMax,
-    cloud_max,
     neighbor_sums,
     product,
-    product_moments,
 )
 
+pytestmark = pytest.mark.usefixtures("double_precision")
 N, K, C, WIDE, FEATURES = 7, 5, 6, 12, 16
 EXACT = 1e-12  # f64 eps x a sum of 100 terms x the scale of the norm
-
-
-@pytest.fixture(autouse=True)
-def _double_precision():
-    with jax.enable_x64(True):
-        yield
 
 
 def parameters(channels: int = C, seed: int = 0) -> dict:
@@ -57,29 +50,6 @@ def run(layer, params, x, mask):
     return jax.jit(layer.apply)({"params": params}, x, mask)
 
 
-@pytest.mark.parametrize("num_groups", [1, 8, FEATURES])
-@pytest.mark.parametrize("shape", [(N, C), (N, K, C), (1, C), (N, K, WIDE), (N, WIDE), (1, WIDE)])
-def test_dense_norm_relu_is_torch_s(shape, num_groups):
-    """Narrow inputs go through their moments, wide ones do not."""
-    x, params = cloud(*shape), parameters(shape[-1])
-    found = run(DenseNormRelu(FEATURES, num_groups), params, x, np.ones(shape[0], bool))
-    # the variance is a difference of moments of inputs up to 10: eps x 100 x 16
-    np.testing.assert_allclose(found, torch_layer(x, params, num_groups), atol=10 * EXACT)
-
-
-@pytest.mark.parametrize("num_groups", [1, 8, FEATURES])
-@pytest.mark.parametrize(
-    ("layer", "shape"), [(DenseNormReluCloudMax, (N, C)), (DenseNormReluMax, (N, K, C))]
-)
-def test_dense_norm_relu_max_is_torch_s(layer, shape, num_groups):
-    x = cloud(*shape)
-    found = run(layer(FEATURES, num_groups), parameters(), x, np.ones(N, bool))
-    expected = torch_layer(x, parameters(), num_groups).max(axis=-2)
-    assert found.shape == (*shape[:-2], FEATURES)
-    # the variance is a difference of moments of inputs up to 10: eps x 100 x 16
-    np.testing.assert_allclose(found, expected, atol=10 * EXACT)
-
-
 def test_single_precision_agrees_too():
     """The moments of the narrow input lose few digits, even beside a bias of 3."""
     params = jax.tree.map(np.float32, parameters())
@@ -95,41 +65,35 @@ def test_single_precision_agrees_too():
         np.testing.assert_allclose(found, expected, atol=2e-5)  # f32 eps x 160
 
 
-LAYERS = (  # with the shape of an input, and what a layer does to all activations
-    (DenseNormRelu(FEATURES), (N, K, C), lambda y: y),
-    (DenseNormRelu(FEATURES), (N, K, WIDE), lambda y: y),
-    (DenseNormReluMax(FEATURES), (N, K, C), lambda y: y.max(axis=1)),
-    (DenseNormReluCloudMax(FEATURES), (N, C), lambda y: y.max(axis=0)),
-)
+LAYERS = [  # with the shape of an input, and what a layer does to all activations
+    # narrow inputs go through their moments, wide ones do not
+    *((DenseNormRelu, (*rows, width), lambda y: y)
+      for rows in ((N,), (N, K), (1,)) for width in (C, WIDE)),
+    (DenseNormReluMax, (N, K, C), lambda y: y.max(axis=1)),
+    (DenseNormReluCloudMax, (N, C), lambda y: y.max(axis=0)),
+]  # fmt: skip
 
 
-def scattered(x: np.ndarray, mask: np.ndarray, junk: float) -> np.ndarray:
-    """The rows of x at the True places of a larger mask, ``junk`` elsewhere."""
-    padded = np.full((*mask.shape, x.shape[-1]), junk)
-    padded[mask] = x.reshape(-1, x.shape[-1])
-    return padded
+@pytest.mark.parametrize("num_groups", [1, 8, FEATURES])
+@pytest.mark.parametrize(("layer", "shape", "reduce"), LAYERS)
+def test_a_layer_is_torch_s_and_padding_has_no_gradient(layer, shape, reduce, num_groups):
+    mask = np.random.default_rng(20).permutation(np.arange(shape[0] + 20) < shape[0])
+    x, params = cloud(*shape), parameters(shape[-1])
+    padded = np.full((len(mask), *shape[1:]), 1e4)
+    padded[mask] = x
+    real = ... if layer is DenseNormReluCloudMax else np.flatnonzero(mask)
 
+    def total(padded):
+        y = layer(FEATURES, num_groups).apply({"params": params}, padded, mask)
+        return jnp.sum(y[real] ** 2), y
 
-def test_padding_changes_nothing_and_has_no_gradient():
-    mask = np.random.default_rng(20).permutation(np.arange(N + 20) < N)
-    for layer, shape, reduce in LAYERS:
-        x, params = cloud(*shape), parameters(shape[-1])
-        rows = jnp.broadcast_to(
-            jnp.expand_dims(mask, range(1, x.ndim - 1)), (len(mask), *shape[1:-1])
-        )
-        padded = scattered(x, np.asarray(rows), 1e4)
-        real = ... if isinstance(layer, DenseNormReluCloudMax) else np.flatnonzero(mask)
-
-        def total(padded, layer=layer, params=params, real=real):
-            y = layer.apply({"params": params}, padded, mask)
-            return jnp.sum(y[real] ** 2), y
-
-        (_, found), gradient = jax.jit(jax.value_and_grad(total, has_aux=True))(padded)
-        expected = reduce(torch_layer(x, params, 8))
-        np.testing.assert_allclose(found[real], expected, atol=10 * EXACT)
-        assert np.isfinite(found).all()
-        np.testing.assert_array_equal(gradient[~mask], 0)
-        assert np.abs(gradient[mask]).max() > 0
+    (_, found), gradient = jax.jit(jax.value_and_grad(total, has_aux=True))(padded)
+    expected = reduce(torch_layer(x, params, num_groups))
+    # the variance is a difference of moments of inputs up to 10: eps x 100 x 16
+    np.testing.assert_allclose(found[real], expected, atol=10 * EXACT)
+    assert np.isfinite(found).all()
+    np.testing.assert_array_equal(gradient[~mask], 0)
+    assert np.abs(gradient[mask]).max() > 0
 
 
 @pytest.mark.parametrize("fused", [DenseNormReluMax, DenseNormReluCloudMax])
@@ -172,15 +136,6 @@ def test_the_product_has_the_gradient_of_a_product():
     check_grads(product, (rng.normal(size=(N, K, C)), rng.normal(size=(C, 4))), 1, ["rev"])
 
 
-def test_moments_of_a_product_are_those_of_its_rows():
-    rng = np.random.default_rng(0)
-    x, kernel, mask = cloud(N, K, C), rng.normal(size=(C, 9)), np.arange(N) != 3
-    rows = (x[mask] @ kernel).reshape(-1, 9)
-    mean, variance = jax.jit(product_moments)(x, kernel, mask)
-    np.testing.assert_allclose(mean, rows.mean(axis=0), atol=EXACT)
-    np.testing.assert_allclose(variance, rows.var(axis=0), atol=100 * EXACT)  # of about 100
-
-
 def test_equal_maxima_share_the_gradient():
     """As `jnp.max` does: neighbourhoods are filled up with copies of a point."""
     y = np.random.default_rng(0).normal(size=(N, K, C))
@@ -195,28 +150,11 @@ def test_equal_maxima_share_the_gradient():
     np.testing.assert_allclose(found, pulled(lambda y: (y.max(1), (y * y).sum(1))), atol=EXACT)
 
 
-def test_the_maximum_of_a_cloud_and_its_gradient():
-    rng = np.random.default_rng(0)
-    x, kernel, mask = rng.normal(size=(N, C)), rng.normal(size=(C, 9)), np.arange(N) != 3
-
-    def plain(x, kernel):
-        return jnp.max(jnp.where(mask[:, None], x @ kernel, -jnp.inf), axis=0)
-
-    def pulled(function):
-        top, pull = jax.vjp(function, x, kernel)
-        return top, *pull(jnp.arange(1.0, 10.0))
-
-    for found, expected in zip(
-        pulled(lambda x, kernel: cloud_max(x, kernel, mask)), pulled(plain), strict=True
-    ):
-        np.testing.assert_allclose(found, expected, atol=EXACT)
-
-
 def test_an_empty_cloud_stays_finite():
     for layer, shape, _ in LAYERS:
 
         def total(params, layer=layer, shape=shape):
-            y = layer.apply({"params": params}, np.zeros(shape), np.zeros(N, bool))
+            y = layer(FEATURES).apply({"params": params}, np.zeros(shape), np.zeros(N, bool))
             return jnp.sum(y)
 
         gradient = jax.jit(jax.grad(total))(parameters(shape[-1]))

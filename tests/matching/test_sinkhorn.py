@@ -13,6 +13,7 @@ from jax.test_util import check_grads
 
 from vanejax.matching.sinkhorn import log_sinkhorn, soft_correspondences
 
+pytestmark = pytest.mark.usefixtures("double_precision")
 ROUNDS = 5
 N, M = 6, 9
 
@@ -26,12 +27,6 @@ def log_assignment(affinity, source_mask=None, target_mask=None, iterations=ROUN
 
 
 mass_gradient = jax.jit(jax.grad(lambda a: jnp.sum(jnp.exp(log_assignment(a)))))
-
-
-@pytest.fixture(autouse=True)
-def _double_precision():
-    with jax.enable_x64(True):
-        yield
 
 
 def affinities(scale: float = 3.0, seed: int = 0) -> np.ndarray:
@@ -57,25 +52,6 @@ def test_log_sinkhorn_is_the_loop(rounds, scale):
     found = log_assignment(affinity, iterations=rounds)
     expected = sinkhorn_by_loop(affinity, rounds)
     np.testing.assert_allclose(found, expected, atol=1e-14 * max(scale, 1) * 30)  # f64 eps x sums
-
-
-def test_rows_and_columns_hold_at_most_one():
-    """Rows too, though columns are normalised last: the column potentials only ever grow."""
-    for affinity in (affinities(), affinities() + 20, affinities(30.0)):
-        for rounds in (1, 2, 5):
-            assignment = np.exp(log_assignment(affinity, iterations=rounds))
-            assert assignment.min() >= 0
-            assert assignment.sum(axis=0).max() <= 1 + 1e-12  # f64 eps x 90 x N
-            assert assignment.sum(axis=1).max() <= 1 + 1e-12
-
-
-def test_strong_affinities_match_and_weak_ones_go_to_the_slack():
-    strong = np.full((N, M), -100.0)
-    strong[np.arange(N), np.arange(N)] = 100.0
-    # of a sure pair the slack keeps 1 / (rounds + 1), since it is never normalised itself
-    expected = np.eye(N, M) * ROUNDS / (ROUNDS + 1)
-    np.testing.assert_allclose(np.exp(log_assignment(strong)), expected, atol=1e-12)
-    assert np.exp(log_assignment(np.full((N, M), -100.0))).max() < 1e-12
 
 
 def test_padding_is_not_there():

@@ -7,7 +7,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 import scipy.special
 from scipy.spatial.transform import Rotation
@@ -96,16 +95,10 @@ def motion(seed: int) -> RigidTransform:
     return RigidTransform(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
 
 
-@pytest.fixture
-def _double():
-    with jax.enable_x64(True):
-        yield
-
-
 # ---- the parts ----
 
 
-@pytest.mark.usefixtures("_double")
+@pytest.mark.usefixtures("double_precision")
 def test_pose_losses_are_the_formulas():
     found, truth = motion(0), motion(1)
     parts = pose_parts(found, truth)
@@ -120,7 +113,7 @@ def test_pose_losses_are_the_formulas():
     assert matrix_loss(truth, truth) < 1e-20
 
 
-@pytest.mark.usefixtures("_double")
+@pytest.mark.usefixtures("double_precision")
 def test_cycle_loss_is_that_of_the_way_there_and_back():
     """With the pointer's columns normalised instead of its rows on the way back."""
     rng = np.random.default_rng(2)
@@ -242,40 +235,3 @@ def test_parts_without_a_factor_are_not_computed(name):
     parts = {"PointNetLK": {"matrix"}, "PCRNet": {"pose"}, "DCP": {"rotation", "translation"}}
     made = jax.eval_shape(metrics)
     assert set(made) == parts[name] | {"rotation_error_deg", "translation_error"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("model", "loss", "batch", "steps", "rate"),
-    [
-        (PointNetLK(), PointNetLKLoss(iterations=3, pairs_at_once=4), 4, 60, 1e-3),
-        (PcrNet(head=(256, 128)), PcrNetLoss(iterations=2, pairs_at_once=16), 16, 200, 3e-3),
-        (
-            Dcp(width=64, num_neighbors=8, heads=2, hidden=64),
-            DcpLoss(matching=0.1, matching_sigma=0.1),
-            4,
-            60,
-            1e-3,
-        ),
-    ],
-)
-def test_training_halves_the_rotation_error(model, loss, batch, steps, rate):
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(rate, steps))
-    )
-
-    def step(carry, key):
-        weights, state = carry
-        pairs = draw(key, batch)
-        (_, metrics), gradients = jax.value_and_grad(
-            lambda weights: loss(model, weights, pairs), has_aux=True
-        )(weights)
-        updates, state = optimizer.update(gradients, state, weights)
-        return (optax.apply_updates(weights, updates), state), metrics["rotation_error_deg"]
-
-    weights = fresh_variables(model)
-    keys = jax.random.split(jax.random.key(2), steps)
-    _, errors = jax.jit(lambda carry: jax.lax.scan(step, carry, keys))(
-        (weights, optimizer.init(weights))
-    )
-    assert errors[-20:].mean() < 0.5 * errors[:5].mean()

@@ -79,13 +79,6 @@ def test_round_trip_keeps_every_bit(scans: ScanSet, tmp_path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["scans.npz"]
 
 
-def test_scanning_twice_gives_the_same(part: Part, scans: ScanSet) -> None:
-    views = scans.viewpoints.select(slice(0, 2))
-    again = make_scan_set(part, CAMERA, views, voxel_mm=VOXEL_MM, progress=False)
-    count = scans.counts[0]
-    np.testing.assert_array_equal(again.points[0, :count], scans.points[0, :count])
-
-
 def test_a_stale_file_names_what_differs(part: Part, scans: ScanSet, tmp_path) -> None:
     scans.save(tmp_path / "scans.npz")
     expected = describe_source(part, CAMERA, scans.viewpoints, voxel_mm=2.0)

@@ -15,6 +15,7 @@ from vanejax.matching.sinkhorn import soft_correspondences
 from vanejax.pointcloud import PointCloud
 from vanejax.training import rpmnet_loss as losses
 
+pytestmark = pytest.mark.usefixtures("double_precision")
 N, M = 5, 7
 SIGMA = 0.3
 SOURCE_MASK, TARGET_MASK = np.arange(N) < 4, np.arange(M) != 2
@@ -27,12 +28,6 @@ LOSSES = {
     "matching": lambda *args: losses.matching_loss(*args, sigma=SIGMA),
     "partner": lambda match, source, target, truth: losses.partner_loss(match, source, truth),
 }
-
-
-@pytest.fixture(autouse=True)
-def _double_precision():
-    with jax.enable_x64(True):
-        yield
 
 
 def make_match(log_assignment, source, target, motion=None) -> Match:

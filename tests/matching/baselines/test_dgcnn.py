@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from network_clouds import scattered
 
 from vanejax.matching.baselines.dgcnn import Dgcnn, neighbor_graph
 
+pytestmark = pytest.mark.usefixtures("double_precision")
 N, K = 30, 6
 EXACT = 1e-10  # f64 eps x five layers' condition of about 1e5
 MODEL = Dgcnn(width=32, num_neighbors=K, edge_widths=(16, 16, 32, 64))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _double_precision():
-    with jax.enable_x64(True):
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -59,31 +53,12 @@ def slow_dgcnn(xyz: np.ndarray, params: dict, k: int) -> np.ndarray:
     return slow_layer(np.concatenate(tops, axis=1), params["point"])
 
 
-def test_it_is_the_slow_twin(params, xyz):
-    found = run(params, xyz, np.ones(N, bool))
-    np.testing.assert_allclose(found, slow_dgcnn(xyz, params, K), atol=EXACT)
-
-
 @pytest.mark.parametrize("junk", [0.0, 1e3])
-def test_padding_changes_nothing(params, xyz, junk):
+def test_it_is_the_slow_twin_whatever_the_padding(params, xyz, junk):
     full, mask = scattered(xyz, N + 13, junk)
     found = run(params, full, mask)
-    np.testing.assert_allclose(found[mask], run(params, xyz, np.ones(N, bool)), atol=EXACT)
+    np.testing.assert_allclose(found[mask], slow_dgcnn(xyz, params, K), atol=EXACT)
     assert np.isfinite(found).all()
-
-
-def test_no_gradient_reaches_padding(params, xyz):
-    full, mask = scattered(xyz, N + 13, 0.1)
-
-    @jax.jit
-    def gradient(full):
-        return jax.grad(lambda x: jnp.sum(jnp.where(mask[:, None], run(params, x, mask), 0) ** 3))(
-            full
-        )
-
-    found = gradient(full)
-    np.testing.assert_array_equal(found[~mask], 0)
-    assert np.abs(found[mask]).max(axis=1).min() > 0
 
 
 def test_neighbours_are_the_nearest_real_points_itself_first(xyz):
@@ -109,13 +84,3 @@ def test_a_cloud_of_fewer_rows_than_neighbours(params, xyz):
     few = xyz[:4]
     found = run(params, few, np.ones(4, bool))
     np.testing.assert_allclose(found, slow_dgcnn(few, params, 4), atol=EXACT)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", ["empty", "one point", "coincident", "line"])
-def test_degenerate_clouds_have_finite_features_and_gradients(params, xyz, case):
-    mask = {"empty": np.zeros(N, bool), "one point": np.arange(N) == 5}.get(case, np.ones(N, bool))
-    points = xyz * {"coincident": 0.0}.get(case, 1.0) * ([1, 0, 0] if case == "line" else 1)
-    value, slopes = jax.value_and_grad(lambda p: jnp.sum(run(p, points, mask) ** 2))(params)
-    assert np.isfinite(value)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
