@@ -32,24 +32,17 @@ if TYPE_CHECKING:
     )
 
 _PLACES = {
-    "cad": ("Part", "guide_vane", "load_part"),
-    "localization": ("PoseResult", "register"),
-    "matching": ("Registration", "RpmNet", "pose_metrics"),
-    "pointcloud": ("PointCloud",),
-    "rigid": ("RigidTransform",),
-    "scanner": ("Camera", "Scanner", "Sensor", "hemisphere_viewpoints", "measure", "preset"),
-    "scans": ("MeasuredScan", "load_scan", "save_points"),
-    "training": (
-        "PairSampling",
-        "RpmNetLoss",
-        "ScanSet",
-        "init_state",
-        "make_bank",
-        "make_scan_set",
-        "make_train_step",
-    ),
+    "cad": "Part guide_vane load_part",
+    "localization": "PoseResult register",
+    "matching": "Registration RpmNet pose_metrics",
+    "pointcloud": "PointCloud",
+    "rigid": "RigidTransform",
+    "scanner": "Camera Scanner Sensor hemisphere_viewpoints measure preset",
+    "scans": "MeasuredScan load_scan save_points",
+    "training": "PairSampling RpmNetLoss ScanSet init_state make_bank make_scan_set "
+    "make_train_step",
 }
-_PLACE_OF = {name: place for place, names in _PLACES.items() for name in names}
+_PLACE_OF = {name: place for place, names in _PLACES.items() for name in names.split()}
 
 __all__ = sorted(_PLACE_OF)  # pyright: ignore[reportUnsupportedDunderAll]
 

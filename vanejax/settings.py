@@ -18,21 +18,15 @@ import difflib
 import math
 import typing
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from vanejax.errors import InputError
 
 _BOUND, _FACTOR = "bound", "factor"
 
 
-@dataclasses.dataclass(frozen=True)
-class Bound:
-    """What a field may be.
-
-    Attributes:
-      holds: whether a value is allowed.
-      words: what goes behind "must", such as "be positive".
-    """
+class Bound(NamedTuple):
+    """What a field may be: whether a value holds, and what goes behind "must"."""
 
     holds: Callable[[Any], bool]
     words: str

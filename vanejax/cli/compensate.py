@@ -190,6 +190,7 @@ def _work_frame(machine_from_part: RigidTransform, chosen: str, part: Part | Non
 def _compensation(compensation: Compensation, chosen: str, part: Part | None) -> list[str]:
     import numpy as np
 
+    from vanejax.machine.controllers import axis_angle_deg
     from vanejax.machine.frame_notation import NOTATIONS
 
     place = "origin" if part is None else "centre"
@@ -197,32 +198,26 @@ def _compensation(compensation: Compensation, chosen: str, part: Part | None) ->
     actual = compensation.machine_from_part.apply(point)[0]
     nominal = compensation.nominal_machine_from_part.apply(point)[0]
     lines = ["", "compensation: from where the program presumes the part to where it is"]
-    lines.append(
-        f"  the part's {place} is moved by {_vector(actual - nominal)} mm (machine x, y, z)"
-    )
-    for frame, motion in (("machine", compensation.in_machine), ("part", compensation.in_part)):
-        lines.append(f"  {_turn(motion)} (in the {frame}'s frame)")
-    names = [n for n in COMPENSATION_FORMATS if chosen in (n, "all")] or ["matrix"]
-    for frame, motion, formula in (
+    moved = _signed(actual - nominal, 4)
+    lines.append(f"  the part's {place} is moved by {moved} mm (machine x, y, z)")
+    motions = (
         ("machine", compensation.in_machine, "actual nominal^-1"),
         ("part", compensation.in_part, "nominal^-1 actual"),
-    ):
+    )
+    for frame, motion, _ in motions:
+        axis, angle = axis_angle_deg(motion.rotation)
+        turned = f"turned by {angle:.4f} deg about ({_signed(axis, 3)})"
+        lines.append(f"  {turned} (in the {frame}'s frame)")
+    names = [n for n in COMPENSATION_FORMATS if chosen in (n, "all")] or ["matrix"]
+    for frame, motion, formula in motions:
         lines += ["", f"compensation in the {frame}'s frame, {formula}:"]
         for name in names:
             lines += [f"  {line}" for line in NOTATIONS[name].write(motion).splitlines()]
     return lines
 
 
-def _turn(motion: RigidTransform) -> str:
-    from vanejax.machine.controllers import axis_angle_deg
-
-    axis, angle = axis_angle_deg(motion.rotation)
-    x, y, z = (round(float(value), 3) + 0.0 for value in axis)
-    return f"turned by {angle:.4f} deg about ({x:+.3f}, {y:+.3f}, {z:+.3f})"
-
-
-def _vector(vector: np.ndarray) -> str:
-    return ", ".join(f"{round(float(value), 4) + 0.0:+.4f}" for value in vector)
+def _signed(vector: np.ndarray, digits: int) -> str:
+    return ", ".join(f"{round(float(value), digits) + 0.0:+.{digits}f}" for value in vector)
 
 
 def _tool_path(
@@ -251,12 +246,11 @@ def _tool_path(
     from vanejax.cad import NearestFace
 
     surface = NearestFace(part)
-    programmed = path
-    if arguments.path_frame == "part":
-        programmed = path.moved(known.nominal_machine_from_part)
     rows = [("compensated", moved)]
     if compensation is not None:
-        rows.append(("as programmed", programmed))
+        in_part = arguments.path_frame == "part"
+        nominal = compensation.nominal_machine_from_part
+        rows.append(("as programmed", path.moved(nominal) if in_part else path))
     for words, points in rows:
         deviation = tool_path_deviation(
             points.points, surface, machine_from_part, tolerance_mm=arguments.tolerance_mm

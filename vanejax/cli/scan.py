@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from vanejax.cad.part import Part
-    from vanejax.scanner.camera import Camera, Viewpoints
-    from vanejax.scanner.ideal_scan import Scan
+    from vanejax.scanner import Camera, Scan, Scanner, Viewpoints
 
 LABELS = "labels.json"
 FORMATS = ("ply", "npz", "xyz", "pcd")
@@ -71,20 +70,18 @@ def run(arguments: argparse.Namespace) -> int:
     folder = Path(arguments.out)
     _check_folder(folder, force=arguments.force)
 
-    from vanejax.scanner.camera import Camera, hemisphere_viewpoints
+    from vanejax.files import write_json
+    from vanejax.scanner import Camera, Scanner, hemisphere_viewpoints
 
     part = workpiece.load_workpiece(arguments)
     camera = Camera().scaled(arguments.resolution)
     viewpoints = hemisphere_viewpoints(part.center, distance_mm=arguments.distance_mm)
     views = parse_views(arguments.views, viewpoints.is_test)
     _claim_folder(folder)
-    counts = _write_scans(arguments, folder, part, camera, viewpoints, views)
-    labels = _labels(arguments, part, camera, viewpoints, views, counts)
-
-    from vanejax.files import write_json
-
-    write_json(folder / LABELS, labels, allow_nan=False)
-    print(f"{folder}: {len(views)} scans of {part.name}, {sum(counts):,} points, and {LABELS}")
+    rows = _write_scans(arguments, folder, Scanner(part), camera, viewpoints, views)
+    write_json(folder / LABELS, _labels(arguments, part, camera) | {"views": rows}, allow_nan=False)
+    count = sum(row["points"] for row in rows)
+    print(f"{folder}: {len(views)} scans of {part.name}, {count:,} points, and {LABELS}")
     return 0
 
 
@@ -124,32 +121,38 @@ def parse_views(text: str, is_test: np.ndarray) -> list[int]:
 def _write_scans(
     arguments: argparse.Namespace,
     folder: Path,
-    part: Part,
+    scanner: Scanner,
     camera: Camera,
     viewpoints: Viewpoints,
     views: list[int],
-) -> list[int]:
-    """Writes a file per view, on all cores; the number of points of each."""
+) -> list[dict[str, Any]]:
+    """Writes a file per view, on all cores; the rows of labels.json."""
     from tqdm import tqdm
 
-    from vanejax.scanner.virtual_scanner import Scanner
-    from vanejax.scans.scan_file import save_points
+    from vanejax.scans import save_points
 
-    scanner = Scanner(part)
-
-    def write_view(view: int) -> int:
+    def write_view(view: int) -> dict[str, Any]:
+        camera_from_part = viewpoints.view(view)
         try:
-            scan = scanner.scan(camera, viewpoints.view(view))
+            scan = scanner.scan(camera, camera_from_part)
         except InputError as error:
             raise InputError(f"view {view}: {error}") from error
         points = _noisy(scan, arguments.noise_mm, seed=(arguments.seed, view))
-        save_points(folder / _file_name(view, arguments.format), points, scan.normals)
-        return len(points)
+        name = f"view_{view:03d}.{arguments.format}"
+        save_points(folder / name, points, scan.normals)
+        return {
+            "file": name,
+            "view": view,
+            "elevation_deg": float(viewpoints.elevation_deg[view]),
+            "azimuth_deg": float(viewpoints.azimuth_deg[view]),
+            "points": len(points),
+            "camera_from_part": camera_from_part.as_matrix().tolist(),
+        }
 
     # an error, or Ctrl-C, leaves the generator of `map`, which cancels the views not yet begun
     with ThreadPoolExecutor() as pool:
-        counts = pool.map(write_view, views)
-        return list(tqdm(counts, "scanning", len(views), unit="view", disable=arguments.quiet))
+        rows = pool.map(write_view, views)
+        return list(tqdm(rows, "scanning", len(views), unit="view", disable=arguments.quiet))
 
 
 def _noisy(scan: Scan, sigma_mm: float, *, seed: tuple[int, int]) -> np.ndarray:
@@ -163,29 +166,7 @@ def _noisy(scan: Scan, sigma_mm: float, *, seed: tuple[int, int]) -> np.ndarray:
     return (scan.points * stretch[:, None]).astype(np.float32)
 
 
-def _file_name(view: int, suffix: str) -> str:
-    return f"view_{view:03d}.{suffix}"
-
-
-def _labels(
-    arguments: argparse.Namespace,
-    part: Part,
-    camera: Camera,
-    viewpoints: Viewpoints,
-    views: list[int],
-    counts: list[int],
-) -> dict[str, Any]:
-    rows = [
-        {
-            "file": _file_name(view, arguments.format),
-            "view": view,
-            "elevation_deg": float(viewpoints.elevation_deg[view]),
-            "azimuth_deg": float(viewpoints.azimuth_deg[view]),
-            "points": count,
-            "camera_from_part": viewpoints.view(view).as_matrix().tolist(),
-        }
-        for view, count in zip(views, counts, strict=True)
-    ]
+def _labels(arguments: argparse.Namespace, part: Part, camera: Camera) -> dict[str, Any]:
     return {
         "format": "vanejax virtual scans",
         "version": 1,
@@ -206,7 +187,6 @@ def _labels(
         "distance_mm": arguments.distance_mm,
         "noise_along_ray_mm": arguments.noise_mm,
         "seed": arguments.seed,
-        "views": rows,
     }
 
 

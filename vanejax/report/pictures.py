@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import base64
-import dataclasses
 import io
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -18,8 +18,7 @@ from vanejax.plotting.scene import Picture, scale_bar_mm
 _ON_DARK = {INK: "#e6e8eb", FAINT: "#8a8f98", GRID: "#33383f"}
 
 
-@dataclasses.dataclass(frozen=True)
-class Image:
+class Image(NamedTuple):
     """A PNG for the page.
 
     Attributes:
@@ -45,13 +44,7 @@ def image(picture: Picture) -> Image:
     options = {"compress_level": 4}  # twice as fast as the default, and a tenth larger
     imsave(data, pixels, format="png", metadata={"Software": None}, pil_kwargs=options)
     bar = scale_bar_mm(picture.width_mm)
-    return Image(
-        uri=_png_uri(data.getvalue()),
-        width=width,
-        height=height,
-        bar_mm=bar,
-        bar_percent=100 * bar / picture.width_mm,
-    )
+    return Image(_png_uri(data.getvalue()), width, height, bar, 100 * bar / picture.width_mm)
 
 
 def figure_uris(figure: Figure) -> tuple[str, str]:

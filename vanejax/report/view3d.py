@@ -24,8 +24,7 @@ from vanejax.plotting.canvas import HIDDEN, SCAN
 from vanejax.plotting.clouds import seen_and_hidden
 from vanejax.plotting.deviation import color_limit_mm
 from vanejax.report import templates
-from vanejax.report.viewer import MAX_POINTS, scene_json, simplified, spacing_mm
-from vanejax.report.viewer import viewer as viewer_of_result
+from vanejax.report.viewer import Viewer, scene, spacing_mm, thinned, viewer
 from vanejax.rigid import RigidTransform
 from vanejax.scanner import Scan
 from vanejax.scans import MeasuredScan
@@ -71,23 +70,6 @@ class View3d:
         write_text(path, self.page)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Controls:
-    """How the poses are chosen and the dots explained.
-
-    Attributes:
-      poses: names of the poses; a single one is no choice.
-      legend: colours of the dots: what `page.css` calls each, and what it means.
-      limit_mm: end of the colour bar; 0 where dots are not coloured by deviation.
-      first: the pose shown at the start.
-    """
-
-    poses: Sequence[str]
-    legend: Sequence[tuple[str, str]]
-    limit_mm: float = 0.0
-    first: int = 0
-
-
 def scan_view(scan: Scan, part: Part, *, voxel_mm: float = 1.5) -> View3d:
     """What a view sees and what self-occlusion hides from it, on the part.
 
@@ -102,42 +84,44 @@ def scan_view(scan: Scan, part: Part, *, voxel_mm: float = 1.5) -> View3d:
     if not voxel_mm > 0:
         raise InputError(f"voxel_mm={voxel_mm!r} should be positive, in mm")
     seen, hidden = seen_and_hidden(scan, voxel_mm=voxel_mm)
-    codes = np.concatenate([np.full(len(seen), -_CODE_UM), np.full(len(hidden), _CODE_UM)])
     points = np.concatenate([seen, hidden])
-    if len(points) > MAX_POINTS:
-        some = np.random.default_rng(0).choice(len(points), MAX_POINTS, replace=False)
-        points, codes = points[some], codes[some]
-    vertices, faces, _ = simplified(
-        np.asarray(part.mesh.vertices, np.float64), np.asarray(part.mesh.faces)
-    )
+    points, codes_um = thinned(points, np.repeat([-_CODE_UM, _CODE_UM], [len(seen), len(hidden)]))
     turn = Rotation.from_euler("yx", [_YAW_DEG, _PITCH_DEG], degrees=True).as_matrix()
-    reader_from_part = turn @ np.asarray(scan.camera_from_part.rotation, np.float64)
-    shown = np.concatenate([vertices, points[:: max(1, len(points) // 500)]])
     here = RigidTransform.identity(dtype=np.float64)
-    scene = scene_json(
+    shown = scene(
         part,
-        vertices,
-        faces,
         points,
+        codes_um,
         {"0": here, "1": here},
         measured=("0", "1"),
-        half_mm=np.abs((shown - part.center) @ reader_from_part.T).max(axis=0),
-        codes_um=codes,
         colors=_SCAN_AND_HIDDEN,
         limit_mm=_CODE_UM / 1000,
-        reader_from_part=reader_from_part,
+        reader_from_part=turn @ np.asarray(scan.camera_from_part.rotation, np.float64),
         spacing_mm=min(_DOT * spacing_mm(points), _LARGEST_DOT * part.radius),
         lift_mm=0.002 * part.radius,
     )
     legend = [("scan", "seen"), ("hidden", "hidden by self-occlusion"), ("metal", "CAD")]
-    return View3d(templates.page("view3d.html", scene=scene, controls=_Controls(["scan"], legend)))
+    return _view(shown, (), legend)
 
 
 def pose_view(result: PoseResult, scan: MeasuredScan, part: Part) -> View3d:
     """The scan on the part at every pose of a result, and where it deviates: as in the report."""
-    shown = viewer_of_result(result, scan, part)
+    shown = viewer(result, scan, part)
     lost = np.isnan(result.verification.deviation_mm).any()
     legend = [("lost", "no partner on the part")] if lost else []
-    limit_mm = color_limit_mm(result.verification)
-    controls = _Controls(shown.poses, legend, limit_mm=limit_mm, first=1)
-    return View3d(templates.page("view3d.html", scene=shown.json, controls=controls))
+    return _view(shown, shown.poses, legend, limit_mm=color_limit_mm(result.verification))
+
+
+def _view(
+    shown: Viewer,
+    poses: Sequence[str],
+    legend: Sequence[tuple[str, str]],
+    *,
+    limit_mm: float = 0.0,
+) -> View3d:
+    """The page; ``legend``: colours of the dots, what `page.css` calls each and what it means.
+
+    ``poses`` can be chosen; ``limit_mm`` ends the colour bar, 0 where dots show no deviation.
+    """
+    values = {"scene": shown.json, "poses": poses, "legend": legend, "limit_mm": limit_mm}
+    return View3d(templates.page("view3d.html", **values))

@@ -7,9 +7,9 @@ simplified where it has more vertices than 16 bits can count, and of the points 
 from __future__ import annotations
 
 import base64
-import dataclasses
 import json
 from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -28,8 +28,7 @@ MAX_POINTS = 60_000
 _NO_DEVIATION = -32768
 
 
-@dataclasses.dataclass(frozen=True)
-class Viewer:
+class Viewer(NamedTuple):
     """The view's data, and what was left out to keep it small.
 
     Attributes:
@@ -56,83 +55,65 @@ def viewer(result: PoseResult, scan: MeasuredScan, part: Part) -> Viewer:
     chosen, deviation = verification.checked, verification.deviation_mm
     if not len(chosen):
         chosen, deviation = np.arange(len(scan.points)), np.full(len(scan.points), np.nan)
-    if len(chosen) > MAX_POINTS:
-        some = np.sort(np.random.default_rng(0).choice(len(chosen), MAX_POINTS, replace=False))
-        chosen, deviation = chosen[some], deviation[some]
-    points = scan.points[chosen]
+    points, codes_um = thinned(scan.points[chosen], _micrometres(deviation))
     poses = {"Before": result.before, "After": result.part_from_camera}
     poses |= {
         f"Alternative {number}": alternative.part_from_camera
         for number, alternative in enumerate(result.alternatives, 1)
     }
-    vertices, faces, detail_mm = simplified(
-        np.asarray(part.mesh.vertices, np.float64), np.asarray(part.mesh.faces)
-    )
     limit_mm = color_limit_mm(verification)
-    reader_from_part = overlay_rotation(scan, part, result.part_from_camera)
-    json_text = scene_json(
+    return scene(
         part,
-        vertices,
-        faces,
         points,
+        codes_um,
         poses,
         measured=("After",),
-        half_mm=np.abs((vertices - part.center) @ reader_from_part.T).max(axis=0),
-        codes_um=_micrometres(deviation),
         colors=colormaps[DEVIATION_COLORMAP](np.linspace(0, 1, 256)),
         limit_mm=limit_mm,
-        reader_from_part=reader_from_part,
+        reader_from_part=overlay_rotation(scan, part, result.part_from_camera),
         spacing_mm=spacing_mm(points),
         # little enough to hide behind the thinnest wall
         lift_mm=min(limit_mm, 0.005 * part.radius),
     )
-    return Viewer(
-        json=json_text,
-        poses=tuple(poses),
-        num_points=len(points),
-        num_faces=len(faces),
-        detail_mm=detail_mm,
-    )
 
 
-def scene_json(
+def scene(
     part: Part,
-    vertices: np.ndarray,
-    faces: np.ndarray,
     points: np.ndarray,
+    codes_um: np.ndarray,
     poses: Mapping[str, RigidTransform],
     *,
     measured: Collection[str],
-    half_mm: np.ndarray,
-    codes_um: np.ndarray,
     colors: np.ndarray,
     limit_mm: float,
     reader_from_part: np.ndarray,
     spacing_mm: float,
     lift_mm: float,
-) -> str:
+) -> Viewer:
     """What `viewer.js` reads.
 
     Args:
       part: about whose centre the view turns.
-      vertices, faces: of its surface as shown, [V, 3] mm and [F, 3], V at most `MAX_VERTICES`.
-      points: [N, 3] mm.
+      points: [N, 3] mm, N at most `MAX_POINTS`.
+      codes_um: [N], deviations in whole micrometres; -32768 for none.
       poses: part_from_points by name, in the order of the buttons.
       measured: names of the poses that the points' codes are for.
-      half_mm: [3], how far the scene reaches from the centre, as the reader sees it.
-      codes_um: [N], deviations in whole micrometres; -32768 for none.
       colors: [256, 4], 0 to 1, from -``limit_mm`` to ``limit_mm``.
       limit_mm: deviation at the ends of the colours.
       reader_from_part: [3, 3], rows right, up, towards the reader.
       spacing_mm: how large dots are drawn.
       lift_mm: how far in front of the surface dots are drawn, at least.
     """
+    vertices, faces, detail_mm = simplified(
+        np.asarray(part.mesh.vertices, np.float64), np.asarray(part.mesh.faces)
+    )
     local_from_part = RigidTransform(np.eye(3), -part.center)
     point_grid, points_from_grid = to_grid(points)
     vertex_grid, part_from_grid = to_grid(vertices)
-    scene = {
+    values = {
         "radius": part.radius,
-        "half_mm": np.asarray(half_mm).tolist(),
+        # how far the part reaches from its centre, as the reader sees it
+        "half_mm": np.abs((vertices - part.center) @ reader_from_part.T).max(axis=0).tolist(),
         "view": columns(RigidTransform(reader_from_part, np.zeros(3)).as_matrix()),
         "mesh": {
             "vertices": to_base64(vertex_grid, "<u2"),
@@ -159,7 +140,16 @@ def scene_json(
         "lost_color": to_rgb(NO_PARTNER),
     }
     # "<" could end the script element
-    return json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    text = json.dumps(values, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return Viewer(text, tuple(poses), len(points), len(faces), detail_mm)
+
+
+def thinned(points: np.ndarray, codes_um: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points [N, 3] and their codes [N]: a random choice of them, if more than `MAX_POINTS`."""
+    if len(points) <= MAX_POINTS:
+        return points, codes_um
+    some = np.sort(np.random.default_rng(0).choice(len(points), MAX_POINTS, replace=False))
+    return points[some], codes_um[some]
 
 
 def simplified(
