@@ -221,17 +221,34 @@ def test_too_many_faces_are_refused(monkeypatch):
         repaired(box().vertices, box().faces)
 
 
-@hypothesis.given(st.data())
+CORNER = st.tuples(*[st.integers(0, 2)] * 3)
+# a body whose edge is used four times, and a union that lays two faces on one another
+TOUCHING_ITSELF = [
+    [(0, 2, 0), (1, 2, 0), (2, 0, 2), (0, 1, 2)],
+    [(0, 1, 2), (0, 2, 0), (2, 2, 1), (1, 0, 2)],
+    [(1, 1, 2), (1, 1, 1), (1, 2, 2), (2, 0, 1)],
+]
+THIN_UNION = [
+    [(0, 2, 0), (2, 0, 2), (1, 1, 2), (0, 0, 2)],
+    [(2, 2, 0), (0, 0, 1), (1, 1, 2), (0, 2, 2)],
+    [(0, 0, 1), (2, 2, 0), (0, 1, 2), (1, 1, 1)],
+]
+
+
+@hypothesis.given(
+    st.lists(st.tuples(*[CORNER] * 4), min_size=1, max_size=5),
+    st.lists(st.integers(0, 19), max_size=2, unique=True),
+    st.lists(st.tuples(*[CORNER] * 3), max_size=2),
+)
+@hypothesis.example(TOUCHING_ITSELF, [], [])
+@hypothesis.example(THIN_UNION, [], [])
 @hypothesis.settings(max_examples=100, deadline=None)
-def test_any_triangles_give_a_closed_solid_or_an_input_error(data):
+def test_any_triangles_give_a_closed_solid_or_an_input_error(tetrahedra, lost, added):
     """Tetrahedra on a coarse grid, with faces lost and added: every coincidence turns up."""
-    corner = st.tuples(*[st.integers(0, 2)] * 3)
-    tetrahedra = data.draw(st.lists(st.tuples(*[corner] * 4), min_size=1, max_size=5))
-    soup = [t[i : i + 1] + t[j : j + 1] + t[k : k + 1] for t in tetrahedra for i, j, k in SIDES]
-    for lost in data.draw(st.lists(st.integers(0, len(soup) - 1), max_size=2, unique=True)):
-        soup[lost] = soup[-1]
-    soup += data.draw(st.lists(st.tuples(*[corner] * 3), max_size=2))
-    vertices = np.array(soup, float).reshape(-1, 3)
+    soup = [(t[i], t[j], t[k]) for t in tetrahedra for i, j, k in SIDES]
+    for face in lost:
+        soup[face % len(soup)] = soup[-1]
+    vertices = np.array(soup + added, float).reshape(-1, 3)
     try:
         repaired(vertices, np.arange(len(vertices)).reshape(-1, 3))
         hypothesis.event("solid")
