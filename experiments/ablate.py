@@ -215,10 +215,6 @@ def list_cells(cells: Sequence[Cell], config: Experiment, workdir: Path) -> None
 
 
 if __name__ == "__main__":
-    CONFIG = command_line.define_config()
-    WORKDIR = flags.DEFINE_string(
-        "workdir", None, "folder of the cells; runs/NAME-ablation with the config's name if none"
-    )
     SWEEPS = flags.DEFINE_multi_string(
         "sweep", [], "FIELD=VALUE,VALUE,... of the config; give it again for a grid"
     )
@@ -231,11 +227,9 @@ if __name__ == "__main__":
     )
     CELLS = flags.DEFINE_bool("cells", False, "list the cells and train none")
 
-    def run() -> None:
+    def run(config: Experiment, workdir: Path) -> None:
         """The command."""
-        config = CONFIG.value
         sweeps, seeds = parse_sweeps(SWEEPS.value, config), parse_seeds(SEEDS.value, config.seed)
-        workdir = Path(WORKDIR.value or f"runs/{config.name}-ablation")
         if MINUTES.value is not None:
             if any(sweep.field == "training.budget_minutes" for sweep in sweeps):
                 raise InputError("--cell_minutes: training.budget_minutes is swept; give one")
@@ -245,4 +239,8 @@ if __name__ == "__main__":
         else:
             ablate(config, sweeps, seeds, workdir)
 
-    command_line.run(run)
+    command_line.run(
+        run,
+        workdir="folder of the cells; runs/NAME-ablation with the config's name if none",
+        default=lambda config: f"runs/{config.name}-ablation",
+    )

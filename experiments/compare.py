@@ -140,18 +140,12 @@ def main(config: Comparison, workdir: Path, methods: list[str], runs: list[str])
 
 
 if __name__ == "__main__":
-    CONFIG = command_line.define_config()
-    WORKDIR = command_line.define_workdir()
     CHOICE = flags.DEFINE_list(
         "methods", [], "these only, such as icp,rpmnet; the config's if none"
     )
     RUNS = flags.DEFINE_multi_string(
         "trained", [], "NAME=FOLDER: take this network from a finished run instead of training it"
     )
-
-    def run() -> None:
-        """The command."""
-        workdir = command_line.workdir(WORKDIR, CONFIG)
-        main(CONFIG.value, workdir, CHOICE.value, RUNS.value)
-
-    command_line.run(run, tree=Comparison)
+    command_line.run(
+        lambda config, workdir: main(config, workdir, CHOICE.value, RUNS.value), tree=Comparison
+    )

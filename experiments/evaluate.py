@@ -120,14 +120,8 @@ def main(config: Experiment, workdir: Path, out: Path, which: str) -> None:
 
 
 if __name__ == "__main__":
-    CONFIG = command_line.define_config()
-    WORKDIR = command_line.define_workdir()
     CHECKPOINT = flags.DEFINE_enum("checkpoint", "latest", ["latest", "best"], "which weights")
     OUT = flags.DEFINE_string("out", None, "folder for the results; the work folder if not given")
-
-    def run() -> None:
-        """The command."""
-        workdir = command_line.workdir(WORKDIR, CONFIG)
-        main(CONFIG.value, workdir, Path(OUT.value or workdir), CHECKPOINT.value)
-
-    command_line.run(run)
+    command_line.run(
+        lambda config, workdir: main(config, workdir, Path(OUT.value or workdir), CHECKPOINT.value)
+    )

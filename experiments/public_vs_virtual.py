@@ -18,12 +18,10 @@ from experiments.runner import command_line
 from experiments.studies.public_vs_virtual.study import main
 
 if __name__ == "__main__":
-    CONFIG = command_line.define_config()
-    WORKDIR = command_line.define_workdir()
     RUNS = flags.DEFINE_multi_string(
         "trained",
         [],
         "NAME=PATH: public or virtual from a finished run, or from a file of PyTorch weights, "
         "instead of training it",
     )
-    command_line.run(lambda: main(CONFIG.value, command_line.workdir(WORKDIR, CONFIG), RUNS.value))
+    command_line.run(lambda config, workdir: main(config, workdir, RUNS.value))

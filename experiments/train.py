@@ -105,6 +105,4 @@ def over_budget(config: Experiment, seconds: float) -> bool:
 
 
 if __name__ == "__main__":
-    CONFIG = command_line.define_config()
-    WORKDIR = command_line.define_workdir()
-    command_line.run(lambda: train(CONFIG.value, command_line.workdir(WORKDIR, CONFIG)))
+    command_line.run(train)

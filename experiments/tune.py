@@ -163,14 +163,8 @@ def table(report: Mapping[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    CONFIG = command_line.define_config()
-    WORKDIR = command_line.define_workdir()
     CHOICE = flags.DEFINE_list("methods", list(CLASSICAL + OPEN3D), "which methods to tune")
     VIEWS = flags.DEFINE_integer("views", 18, "training views to tune on", lower_bound=1)
-
-    def run() -> None:
-        """The command."""
-        workdir = command_line.workdir(WORKDIR, CONFIG)
-        tune(CONFIG.value, workdir, CHOICE.value, VIEWS.value)
-
-    command_line.run(run, tree=Comparison)
+    command_line.run(
+        lambda config, workdir: tune(config, workdir, CHOICE.value, VIEWS.value), tree=Comparison
+    )

@@ -26,38 +26,40 @@ flags.disclaim_key_flags()  # the flags defined here belong to the command that 
 _OVERRIDE = re.compile(r"--?config\.([^=]+)")
 
 
-def define_config() -> flags.FlagHolder:
-    """Defines ``--config``; its value is what `run` is told it is once flags are parsed."""
-    return config_flags.DEFINE_config_file(
+WORKDIR = (
+    "folder of the run; if not given, runs/NAME with the config's name, and -NETWORK where another "
+    "network than RPM-Net is trained"
+)
+
+
+def default_workdir(config: Any) -> str:
+    """The folder of a run whose command line names none."""
+    network = config.model.name if isinstance(config, Experiment) else "rpmnet"
+    return f"runs/{config.name}" if network == "rpmnet" else f"runs/{config.name}-{network}"
+
+
+def define_flags(workdir: str = WORKDIR) -> None:
+    """Defines ``--config`` and ``--workdir`` with these words of help."""
+    config_flags.DEFINE_config_file(
         "config",
         None,
         f"a file with get_config(), here or in experiments/configs/ ({_names()}). Any field can be "
         "overridden: --config.model.num_neighbors=16",
     )
+    flags.DEFINE_string("workdir", None, workdir)
 
 
-def define_workdir() -> flags.FlagHolder:
-    """Defines ``--workdir``; see `workdir` for its default."""
-    return flags.DEFINE_string(
-        "workdir",
-        None,
-        "folder of the run; if not given, runs/NAME with the config's name, and -NETWORK where "
-        "another network than RPM-Net is trained",
-    )
+def run(
+    main: Callable[[Any, Path], object],
+    *,
+    tree: type = Experiment,
+    workdir: str = WORKDIR,
+    default: Callable[[Any], str] = default_workdir,
+) -> None:
+    """Parses the command line, runs ``main`` on config and work folder, exits with its `exit_code`.
 
-
-def workdir(given: flags.FlagHolder, config: flags.FlagHolder) -> Path:
-    """The folder of the run."""
-    settings = config.value
-    network = settings.model.name if isinstance(settings, Experiment) else "rpmnet"
-    name = settings.name if network == "rpmnet" else f"{settings.name}-{network}"
-    return Path(given.value or f"runs/{name}")
-
-
-def run(main: Callable[[], object], *, tree: type = Experiment) -> None:
-    """Parses the command line, runs ``main`` and exits with its `exit_code`.
-
-    ``tree`` is the dataclass that a config file's ``get_config()`` must return.
+    ``tree`` is the dataclass that a config file's ``get_config()`` must return; ``workdir`` is the
+    help of ``--workdir``, and ``default`` the folder where it is not given.
     """
 
     def guarded(rest: list[str]) -> int:
@@ -76,12 +78,14 @@ def run(main: Callable[[], object], *, tree: type = Experiment) -> None:
                 f"{tree.__name__}; see --help"
             )
         compilation_cache.enable()
-        main()
+        config = flags.FLAGS.config
+        main(config, Path(flags.FLAGS.workdir or default(config)))
 
     def parsed_and_run() -> None:
         parser = functools.partial(_parse, tree)
         app.run(guarded, argv=resolve_config(sys.argv), flags_parser=parser)
 
+    define_flags(workdir)
     sys.exit(exit_code(parsed_and_run))
 
 

@@ -142,7 +142,8 @@ def parse_flags(path: Path, rest: list[str], monkeypatch: pytest.MonkeyPatch) ->
     """Runs a command of `experiments.runner.command_line` up to where the work would begin."""
     before = set(flags.FLAGS)
 
-    def parse_only(run: FunctionType, *, tree: type = Experiment) -> None:
+    def parse_only(run: FunctionType, *, tree: type = Experiment, **_: object) -> None:
+        command_line.define_flags()
         left = command_line._parse(tree, command_line.resolve_config(sys.argv))
         assert left[1:] == [], f"no such argument: {left[1:]}"
         config = flags.FLAGS.config
@@ -157,7 +158,8 @@ def parse_flags(path: Path, rest: list[str], monkeypatch: pytest.MonkeyPatch) ->
                 and value is not run
             ):
                 space[name] = lambda *_, **__: 0
-        run()
+        if run.__name__ != "train":  # the work itself
+            run(config, Path("runs"))
 
     monkeypatch.setattr(sys, "argv", [path.stem, *rest])
     monkeypatch.setattr(command_line, "run", parse_only)

@@ -13,7 +13,7 @@ from absl import flags
 
 from experiments.configs import smoke, table1
 from experiments.runner import command_line
-from experiments.runner.command_line import resolve_config, workdir
+from experiments.runner.command_line import default_workdir, resolve_config
 from experiments.runner.experiment import Experiment
 from vanejax.errors import InputError
 from vanejax.pointcloud import PointCloud
@@ -21,11 +21,6 @@ from vanejax.rigid import RigidTransform
 from vanejax.training import Pair, RpmNetLoss
 
 ROOT = Path(__file__).parents[3]
-
-
-def value(content: object) -> SimpleNamespace:
-    """What a flag holds."""
-    return SimpleNamespace(value=content)
 
 
 def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -45,11 +40,10 @@ def command(monkeypatch) -> Callable[..., int]:
 
     def run_here(*arguments: str, main: Callable[[Experiment], object] = Experiment.check) -> int:
         before = set(flags.FLAGS)
-        config, _ = command_line.define_config(), command_line.define_workdir()
         monkeypatch.setattr(sys, "argv", ["train", *arguments])
         try:
             with pytest.raises(SystemExit) as left:
-                command_line.run(lambda: main(config.value))
+                command_line.run(lambda config, _: main(config))
         finally:
             for name in set(flags.FLAGS) - before:
                 delattr(flags.FLAGS, name)
@@ -171,11 +165,10 @@ def test_a_loss_needs_one_file_that_a_config_names(command, tmp_path, capsys) ->
 
 def test_another_network_has_a_folder_of_its_own() -> None:
     config = smoke.get_config()
-    assert workdir(value(None), value(config)) == Path("runs/smoke")
+    assert default_workdir(config) == "runs/smoke"
     config.model.name = "dcp"
-    assert workdir(value(None), value(config)) == Path("runs/smoke-dcp")
-    assert workdir(value("here"), value(config)) == Path("here")
-    assert workdir(value(None), value(table1.get_config())) == Path("runs/table1")
+    assert default_workdir(config) == "runs/smoke-dcp"
+    assert default_workdir(table1.get_config()) == "runs/table1"
 
 
 def test_help_names_the_config_and_the_workdir() -> None:
