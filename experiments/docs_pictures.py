@@ -24,7 +24,7 @@ from vanejax.plotting.canvas import (
 )
 from vanejax.plotting.casting import casting_map
 from vanejax.plotting.matching import Matching, matching_lines
-from vanejax.plotting.segments import segments_picture
+from vanejax.plotting.sensing import segments_picture
 from vanejax.rigid import RigidTransform
 from vanejax.scanner import (
     Camera,

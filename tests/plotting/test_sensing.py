@@ -12,12 +12,12 @@ from experiments.studies.sensor_effects import study as sensor_effects
 from experiments.studies.sensor_effects.study import effects, table
 from vanejax.cad.parametric_vane import guide_vane
 from vanejax.errors import InputError
-from vanejax.plotting.segments import segments_picture
 from vanejax.plotting.sensing import (
     REASON_COLORS,
     error_image,
     measurements_picture,
     off_surface_mm,
+    segments_picture,
 )
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
 from vanejax.scanner.clutter import Clutter, clutter_scene

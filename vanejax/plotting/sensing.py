@@ -1,4 +1,4 @@
-"""What a sensor made of a scan: errors where it measured, reasons where it did not."""
+"""What a sensor and a segmentation made of a scan, pixel by pixel."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ from matplotlib.colors import Normalize, SymLogNorm, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from vanejax.errors import InputError
 from vanejax.plotting import canvas
-from vanejax.plotting.shading import crop_size, draw_part
-from vanejax.scanner import Measurement, Reason
+from vanejax.plotting.shading import crop_size, draw_part, shade
+from vanejax.scanner import Camera, Measurement, Reason, Scan
+from vanejax.scanner.clutter import ClutterScene
+from vanejax.scans import Segment, Segments
 
 REASON_COLORS = {
     Reason.SHADOWED: canvas.INK,
@@ -23,6 +26,11 @@ REASON_COLORS = {
     Reason.DARK: "#6b8e00",
     Reason.LOST: "#a9adb4",
     Reason.OUT_OF_RANGE: "#0072b2",
+}
+_SEGMENTS = {
+    Segment.PART: ("part", canvas.SCAN),
+    Segment.TABLE: ("table", canvas.TABLE),
+    Segment.OTHER: ("clutter", canvas.CLUTTER),
 }
 LINEAR_MM = 0.01  # colours are linear up to here, logarithmic beyond
 
@@ -83,9 +91,8 @@ def error_image(measurement: Measurement, scale: Normalize) -> np.ndarray:
     reason = measurement.organised()["reason"]
     image = np.ones((*reason.shape, 3))
     measured = reason == Reason.MEASURED
-    image[measured] = colormaps[canvas.DEVIATION_COLORMAP](scale(off_surface_mm(measurement)))[
-        :, :3
-    ]
+    colors = colormaps[canvas.DEVIATION_COLORMAP](scale(off_surface_mm(measurement)))
+    image[measured] = colors[:, :3]
     for why, color in REASON_COLORS.items():
         image[reason == why] = to_rgb(color)
     return image
@@ -95,3 +102,54 @@ def off_surface_mm(measurement: Measurement) -> np.ndarray:
     """[n] f64, how far each point stands off the face that it was measured on, outward."""
     moved = measurement.points.astype(np.float64) - measurement.ideal.points[measurement.kept]
     return np.einsum("ni,ni->n", moved, measurement.normals)
+
+
+def segments_picture(scan: Scan, camera: Camera, scene: ClutterScene, segments: Segments) -> Figure:
+    """A scene as the camera sees it, coloured twice: by the segmentation, and by the truth.
+
+    Args:
+      scan: of the whole scene, N pixels.
+      camera: that made it.
+      scene: that was scanned: it knows whose each face is.
+      segments: of the scan's points, noisy or not, in their order.
+
+    Raises:
+      InputError: segments of another number of points.
+    """
+    if len(segments.label) != len(scan.points):
+        raise InputError(
+            f"the scan has {len(scan.points):,} points, the segmentation {len(segments.label):,}"
+        )
+    owner = scene.owner(scan.face)
+    kinds = [Segment.PART] + [
+        Segment.TABLE if item.kind == "table" else Segment.OTHER for item in scene.objects
+    ]
+    truth = np.array(kinds, np.uint8)[owner]
+    light = shade(scan, camera)
+    aspect = camera.fx / camera.fy
+    figure = canvas.new_figure(
+        canvas.WIDTH_IN, canvas.WIDTH_IN / 2 * aspect * camera.height / camera.width + 0.6
+    )
+    wrong = float(np.mean(segments.label != truth))
+    for axes, label, title in zip(
+        figure.subplots(1, 2),
+        (segments.label, truth),
+        (f"segmentation ({wrong:.1%} of the points wrong)", "truth"),
+        strict=True,
+    ):
+        image = _colored(light, scan, camera, label)
+        axes.imshow(image, aspect=aspect, interpolation="antialiased")
+        axes.set_axis_off()
+        canvas.name_panel(axes, title)
+    present = [s for s in Segment if np.any(truth == s) or np.any(segments.label == s)]
+    canvas.name_colors(figure, dict(_SEGMENTS[s] for s in present))
+    return figure
+
+
+def _colored(light: np.ndarray, scan: Scan, camera: Camera, label: np.ndarray) -> np.ndarray:
+    """[H, W, 3]: the shaded image in the colours of the labels [N], white where nothing is."""
+    image = np.ones((camera.height * camera.width, 3))
+    grey = light.reshape(-1, 3)[scan.pixel].mean(axis=1, keepdims=True)
+    colors = np.array([to_rgb(_SEGMENTS[s][1]) for s in Segment])
+    image[scan.pixel] = np.clip(grey / np.percentile(grey, 80), 0.25, 1.1) * colors[label]
+    return np.clip(image, 0, 1).reshape(camera.height, camera.width, 3)

@@ -6,9 +6,8 @@ import datetime
 import importlib.metadata
 import os
 import platform
-import warnings
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,6 +17,7 @@ from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.files import write_text
 from vanejax.localization.pose_result import PointStatus, PoseResult, Uncertainty
+from vanejax.machine.pose_file import pose_to_dict
 from vanejax.plotting.deviation import (
     STATUS_COLORS,
     color_limit_mm,
@@ -49,16 +49,6 @@ _ADVICE = {
     "ambiguous": "More than one pose explains this scan. Do not machine before it is decided.",
     "rejected": "Do not use this pose.",
 }
-
-
-class _Pose(NamedTuple):
-    """A pose in the forms that machines ask for; all of them text."""
-
-    matrix: list[list[str]]
-    quaternion: list[str]
-    euler: list[str]
-    translation: list[str]
-    locked: bool
 
 
 def write_report(
@@ -142,26 +132,22 @@ def _advice(result: PoseResult) -> str:
     return _ADVICE[result.verdict.status]
 
 
-def _pose(transform: RigidTransform) -> _Pose:
-    """The transform's numbers as text."""
-    matrix = np.asarray(transform.as_matrix(), np.float64)
-    rotation = Rotation.from_matrix(matrix[:3, :3])
-    with warnings.catch_warnings():
-        # scipy warns where only the sum of two angles is defined; the page says so instead
-        warnings.simplefilter("ignore", UserWarning)
-        euler = rotation.as_euler("xyz", degrees=True)
-    x, y, z, w = rotation.as_quat(canonical=True)
-    return _Pose(
-        matrix=[
-            [fixed(v, 4 if column == 3 else 8) for column, v in enumerate(row)]
-            for row in matrix[:3]
-        ]
-        + [["0", "0", "0", "1"]],
-        quaternion=[fixed(v, 8) for v in (w, x, y, z)],
-        euler=[fixed(v, 5) for v in euler],
-        translation=[fixed(v, 4) for v in matrix[:3, 3]],
-        locked=bool(abs(abs(euler[1]) - 90) < 1e-4),
-    )
+def _pose(transform: RigidTransform) -> dict[str, Any]:
+    """The transform in the forms that machines ask for, all of them text."""
+    values = pose_to_dict(transform)
+    numbers = values["part_from_camera_as"]
+    matrix = [
+        [fixed(v, 4 if column == 3 else 8) for column, v in enumerate(row)]
+        for row in values["part_from_camera"][:3]
+    ]
+    return {
+        "matrix": [*matrix, ["0", "0", "0", "1"]],
+        "quaternion": [fixed(v, 8) for v in numbers["quaternion_wxyz"]],
+        "euler": [fixed(v, 5) for v in numbers["euler_xyz_deg"]],
+        "translation": [fixed(v, 4) for v in numbers["translation_mm"]],
+        # only the sum or difference of the other two angles is defined there
+        "locked": abs(abs(numbers["euler_xyz_deg"][1]) - 90) < 1e-4,
+    }
 
 
 def _difference(true: RigidTransform, found: RigidTransform, center: np.ndarray) -> np.ndarray:
