@@ -113,7 +113,7 @@ def registration_overlays(overlays: Sequence[Overlay]) -> Figure:
     return figure
 
 
-def method_displacements(overlays: Mapping[str, Overlay], *, columns: int = 4) -> Figure:
+def method_displacements(overlays: Mapping[str, Overlay]) -> Figure:
     """How far several methods leave the points of one view from where they truly lie.
 
     The paper's Fig. 3 shows the clouds alone, which look alike. Here each point has the colour of
@@ -121,7 +121,6 @@ def method_displacements(overlays: Mapping[str, Overlay], *, columns: int = 4) -
 
     Args:
       overlays: by method, of the same view.
-      columns: panels side by side.
 
     Raises:
       InputError: no registration.
@@ -129,7 +128,7 @@ def method_displacements(overlays: Mapping[str, Overlay], *, columns: int = 4) -
     if not overlays:
         raise InputError("method_displacements needs at least one registration")
     limit = limits([c for o in overlays.values() for c in (o.true, o.reference)])
-    columns = min(columns, len(overlays))
+    columns = min(4, len(overlays))
     lines = -(-len(overlays) // columns)
     width = (WIDTH_IN - 0.8) / columns
     figure = new_figure(

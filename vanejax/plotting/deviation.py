@@ -139,9 +139,8 @@ def color_limit_mm(verification: Verification) -> float:
 
 def deviation_colors(deviation_mm: np.ndarray, limit_mm: float) -> np.ndarray:
     """Colours [n, 3], 0 to 1, of signed deviations [n] in mm; NaN has a colour of its own."""
-    colors = colormaps[canvas.DEVIATION_COLORMAP](Normalize(-limit_mm, limit_mm)(deviation_mm))[
-        :, :3
-    ]
+    scale = Normalize(-limit_mm, limit_mm)
+    colors = colormaps[canvas.DEVIATION_COLORMAP](scale(deviation_mm))[:, :3]
     colors[np.isnan(deviation_mm)] = to_rgb(canvas.NO_PARTNER)
     return colors
 

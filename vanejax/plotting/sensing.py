@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -32,26 +31,24 @@ _SEGMENTS = {
     Segment.TABLE: ("table", canvas.TABLE),
     Segment.OTHER: ("clutter", canvas.CLUTTER),
 }
-LINEAR_MM = 0.01  # colours are linear up to here, logarithmic beyond
+_LINEAR_MM = 0.01  # colours are linear up to here, logarithmic beyond
 
 
-def measurements_picture(
-    measurements: Mapping[str, Measurement], *, limit_mm: float = 1.0, columns: int = 4
-) -> Figure:
+def measurements_picture(measurements: Mapping[str, Measurement]) -> Figure:
     """A panel for each measurement by its title: what the camera's image shows of the part.
 
     Measured pixels are coloured by how far their points stand off the true surface, outward, on one
-    scale from ``-limit_mm`` to ``limit_mm`` that shows hundredths and whole millimetres; the others
-    by the reason why they are not measured. Both figures stand in the titles.
+    scale from -1 to 1 mm that shows hundredths and whole millimetres; the others by the reason why
+    they are not measured. Both figures stand in the titles.
     """
-    columns = min(columns, len(measurements))
+    columns = min(4, len(measurements))
     lines = -(-len(measurements) // columns)
     first = next(iter(measurements.values()))
     wide, high = crop_size(first.ideal, first.sensor.camera)
     width = (canvas.WIDTH_IN - 0.8) / columns
     figure = canvas.new_figure(width * columns + 0.8, (width * high / wide + 0.35) * lines + 0.3)
     panels = figure.subplots(lines, columns, squeeze=False)
-    scale = SymLogNorm(LINEAR_MM, vmin=-limit_mm, vmax=limit_mm)
+    scale = SymLogNorm(_LINEAR_MM, vmin=-1.0, vmax=1.0)
     for axes in panels.flat:
         axes.set_axis_off()
     for axes, (title, measurement) in zip(panels.flat, measurements.items(), strict=False):
@@ -68,13 +65,12 @@ def measurements_picture(
         for reason, color in REASON_COLORS.items()
         if reason in seen
     ]
-    if handles:
-        blank = panels.size - len(measurements)
-        place: dict[str, Any] = {"loc": "center"}
-        if not blank:
-            place = {"loc": "outside lower center", "ncols": len(handles)}
-        canvas.add_legend(panels.flat[-1] if blank else figure, handles, title="not measured",
-                   title_fontsize=canvas.LABEL_PT, **place)  # fmt: skip
+    words = {"title": "not measured", "title_fontsize": canvas.LABEL_PT}
+    if handles and panels.size > len(measurements):  # in the panel that is left
+        canvas.add_legend(panels.flat[-1], handles, loc="center", **words)
+    elif handles:
+        place = {"loc": "outside lower center", "ncols": len(handles)}
+        canvas.add_legend(figure, handles, **place, **words)
     return figure
 
 
