@@ -14,7 +14,6 @@ from collections.abc import Iterator
 import numpy as np
 
 BLOCK = 1 << 15  # faces at a time: their arrays stay in the cache
-_HASH_FACTOR = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: odd, so nothing is lost
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,8 +174,6 @@ def drop_doubled(mesh: Triangles, notes: list[str]) -> Triangles:
     Two copies that face apart are an inner wall between touching bodies: both go. Where most of
     the mesh is doubled, the file was written two-sided: one copy stays.
     """
-    if not _may_repeat(mesh.faces):
-        return mesh
     order, new = _sorted_rows(np.sort(mesh.faces, axis=1).astype(np.int32))
     if new.all():
         return mesh
@@ -195,19 +192,6 @@ def drop_doubled(mesh: Triangles, notes: list[str]) -> Triangles:
     why = "of a surface written two-sided" if two_sided else "that repeat or cancel another"
     notes.append(f"dropped {counted(int(np.sum(~keep)), 'face')} {why}")
     return Triangles(mesh.points, faces)
-
-
-def _may_repeat(faces: np.ndarray) -> bool:
-    """Whether two faces may have the same three vertices: their hashes are sorted, not they."""
-    a, b, c = (faces[:, corner].astype(np.uint64) for corner in range(3))
-    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-    code = low << np.uint64(32) | (a + b + c - low - high)
-    code *= _HASH_FACTOR
-    code ^= code >> np.uint64(32)
-    code ^= high
-    code *= _HASH_FACTOR
-    code.sort()
-    return bool(np.any(code[1:] == code[:-1]))
 
 
 def areas(corners: np.ndarray) -> np.ndarray:

@@ -44,13 +44,20 @@ def write_matrix(machine_from_part: RigidTransform) -> str:
     )
 
 
-def write_kuka(machine_from_part: RigidTransform) -> str:
-    """KUKA's FRAME: A turns about z, B about the y so turned, C about the x turned twice.
+def _writer(template: str, order: str, *, sign: str = "") -> Callable[[RigidTransform], str]:
+    """Fills in X, Y, Z and three angles in an order as scipy names it, rounded."""
 
-    Source: KUKA System Software, operating and programming instructions.
-    """
-    x, y, z, c, b, a = _numbers(machine_from_part, "xyz")
-    return f"{{X {x},Y {y},Z {z},A {a},B {b},C {c}}}"
+    def write(machine_from_part: RigidTransform) -> str:
+        angles = euler_deg(machine_from_part.rotation, order)
+        shift = [_fixed(v, DECIMALS_MM, sign=sign) for v in machine_from_part.translation]
+        return template.format(*shift, *(_fixed(v, DECIMALS_DEG, sign=sign) for v in angles))
+
+    return write
+
+
+# A turns about z, B about the y so turned, C about the x turned twice
+# (KUKA System Software, operating and programming instructions).
+write_kuka = _writer("{{X {0},Y {1},Z {2},A {5},B {4},C {3}}}", "xyz")
 
 
 def read_kuka(text: str) -> RigidTransform:
@@ -61,19 +68,13 @@ def read_kuka(text: str) -> RigidTransform:
     items = [re.split(r"\s+", item.strip() + " ", maxsplit=1) for item in match[1].split(",")]
     words = [(name.upper(), value.strip()) for name, value in items]
     values = _values(words, "XYZABC", "the KUKA frame")
-    return _frame(values, values, "ZYX", "ABC")
+    return _frame(values, [values[name] for name in "ABC"])
 
 
-def write_iso(machine_from_part: RigidTransform) -> str:
-    """A work offset, and a tilted working plane upon it.
-
-    G10 L2 P1 sets G54: the part's origin in the machine. G68.2 X Y Z I J K gives a feature
-    coordinate system upon the active offset, here with the same origin, turned by Euler angles:
-    I about Z, J about the turned X, K about the Z turned twice (Fanuc; post processors call it
-    EULER_ZXZ_R).
-    """
-    x, y, z, i, j, k = _numbers(machine_from_part, "ZXZ")
-    return f"G90 G10 L2 P1 X{x} Y{y} Z{z}\nG54\nG68.2 X0. Y0. Z0. I{i} J{j} K{k}"
+# G10 L2 P1 sets G54: the part's origin in the machine. G68.2 is a tilted working plane upon it,
+# here with the same origin: I turns about Z, J about the turned X, K about the Z turned twice
+# (Fanuc; post processors call it EULER_ZXZ_R).
+write_iso = _writer("G90 G10 L2 P1 X{} Y{} Z{}\nG54\nG68.2 X0. Y0. Z0. I{} J{} K{}", "ZXZ")
 
 
 def read_iso(text: str) -> RigidTransform:
@@ -100,7 +101,7 @@ def read_iso(text: str) -> RigidTransform:
             if tilted is not None:
                 raise InputError(f"{block} is a second G68.2")
             values = _values(others, "XYZIJK", "G68.2 (with Euler angles, without P)", some=True)
-            tilted = _frame(values, values, "ZXZ", "IJK")
+            tilted = _frame(values, [values[name] for name in "IJK"], "ZXZ")
         elif others or "10" in codes:
             if offset is not None:
                 raise InputError(f"{block} is a second work offset")
@@ -123,18 +124,14 @@ def read_iso(text: str) -> RigidTransform:
     return offset if tilted is None else offset @ tilted
 
 
-def write_heidenhain(machine_from_part: RigidTransform) -> str:
-    """A datum shift and PLANE SPATIAL, upon a preset that is the machine's datum.
-
-    SPA, SPB, SPC turn about the fixed X, then Y, then Z, which is the same as C, B, A about the
-    turned axes (TNC 620, conversational programming, 10/2017, p. 540). STAY moves no axis.
-    """
-    x, y, z, a, b, c = _numbers(machine_from_part, "xyz", sign="+")
-    return (
-        "CYCL DEF 7.0 DATUM SHIFT\n"
-        f"CYCL DEF 7.1 X{x}\nCYCL DEF 7.2 Y{y}\nCYCL DEF 7.3 Z{z}\n"
-        f"PLANE SPATIAL SPA{a} SPB{b} SPC{c} STAY"
-    )
+# Upon a preset that is the machine's datum. SPA, SPB, SPC turn about the fixed X, then Y, then Z
+# (TNC 620, conversational programming, 10/2017, p. 540). STAY moves no axis.
+write_heidenhain = _writer(
+    "CYCL DEF 7.0 DATUM SHIFT\nCYCL DEF 7.1 X{}\nCYCL DEF 7.2 Y{}\nCYCL DEF 7.3 Z{}\n"
+    "PLANE SPATIAL SPA{} SPB{} SPC{} STAY",
+    "xyz",
+    sign="+",
+)
 
 
 def read_heidenhain(text: str) -> RigidTransform:
@@ -149,17 +146,12 @@ def read_heidenhain(text: str) -> RigidTransform:
         return _frame(values)
     words = re.findall(rf"SP([A-Z])\s*({_NUMBER})(?![\d.])", planes[0])
     angles = _values(words, "ABC", "PLANE SPATIAL, SP")
-    return _frame(values, angles, "ZYX", "CBA")
+    return _frame(values, [angles[name] for name in "CBA"])
 
 
-def write_siemens(machine_from_part: RigidTransform) -> str:
-    """The settable frame of G54 with its rotation.
-
-    CTRANS, then CROT with RPY angles: Z, then the turned Y, then the X turned twice (MD10600 = 1,
-    the default; SINUMERIK 840D sl, Basic Functions, K2, 11/2006, p. 56).
-    """
-    x, y, z, a, b, c = _numbers(machine_from_part, "xyz")
-    return f"$P_UIFR[1]=CTRANS(X,{x},Y,{y},Z,{z}):CROT(X,{a},Y,{b},Z,{c})"
+# The settable frame of G54. CROT turns by RPY angles: Z, then the turned Y, then the X turned twice
+# (MD10600 = 1, the default; SINUMERIK 840D sl, Basic Functions, K2, 11/2006, p. 56).
+write_siemens = _writer("$P_UIFR[1]=CTRANS(X,{},Y,{},Z,{}):CROT(X,{},Y,{},Z,{})", "xyz")
 
 
 def read_siemens(text: str) -> RigidTransform:
@@ -177,7 +169,8 @@ def read_siemens(text: str) -> RigidTransform:
         if len(items) % 2:
             raise InputError(f"{name}({inside}) should be pairs of an axis and a number")
         values.append(_values(list(zip(items[::2], items[1::2], strict=True)), "XYZ", name))
-    return _frame(*values, "ZYX", "ZYX") if len(values) == 2 else _frame(*values)
+    shift, *turn = values
+    return _frame(shift, [turn[0][name] for name in "ZYX"]) if turn else _frame(shift)
 
 
 NOTATIONS: Mapping[str, Notation] = {
@@ -230,22 +223,12 @@ def notation_of(text: str) -> str:
 
 
 def _frame(
-    shift: Mapping[str, float],
-    turn: Mapping[str, float] | None = None,
-    order: str = "ZYX",
-    names: str = "ABC",
+    shift: Mapping[str, float], angles_deg: Sequence[float] = (0, 0, 0), order: str = "ZYX"
 ) -> RigidTransform:
-    """The frame at X, Y, Z of ``shift``, turned by named angles in an order as scipy names it."""
-    angles_deg = [turn[name] for name in names] if turn else [0.0, 0.0, 0.0]
+    """The frame at X, Y, Z of ``shift``, turned by three angles in an order as scipy names it."""
     # a whole number of turns less: degrees are exact, radians are not
     rotation = Rotation.from_euler(order, np.remainder(angles_deg, 360.0), degrees=True)
     return RigidTransform(rotation.as_matrix(), np.array([shift[name] for name in "XYZ"]))
-
-
-def _numbers(frame: RigidTransform, order: str, *, sign: str = "") -> list[str]:
-    """X, Y, Z and three angles in an order as scipy names it, rounded."""
-    shift = [_fixed(v, DECIMALS_MM, sign=sign) for v in frame.translation]
-    return shift + [_fixed(v, DECIMALS_DEG, sign=sign) for v in euler_deg(frame.rotation, order)]
 
 
 def _fixed(value: float, places: int, *, sign: str = "") -> str:
