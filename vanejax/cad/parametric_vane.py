@@ -1,18 +1,14 @@
 """A guide-vane segment: the turbine nozzle part that stands in for the paper's unpublished CAD.
 
-Several vanes stand between an inner and an outer platform, which carry the rails that hang the
-segment in its casing. The shape is built in ring coordinates (axial mm, downstream from the
-trailing edges; angle about the engine's axis, radians; radius mm; x = radius sin(angle),
-y = radius cos(angle), z = -axial) and delivered in the part's frame: x along the
-circumference, y radially outward, z upstream, so that the leading edges look toward +z; the
-origin is the middle of the axis-aligned bounding box.
+It is built in ring coordinates (axial mm, downstream from the trailing edges; angle about the
+engine's axis, radians; radius mm) and delivered in the part's frame: x along the circumference, y
+radially outward, z upstream; the origin is the middle of the axis-aligned bounding box.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
 
 import manifold3d
 import numpy as np
@@ -43,20 +39,17 @@ _INNER_AIRFOIL = Airfoil(
     trailing_edge_radius_mm=0.7,
     throat_mm=10.9,
 )
-_OUTER_AIRFOIL = Airfoil(
+_OUTER_AIRFOIL = dataclasses.replace(
+    _INNER_AIRFOIL,
     axial_chord_mm=36.5,
     tangential_chord_mm=40.5,
-    inlet_angle_deg=0.0,
     exit_angle_deg=-71.0,
-    inlet_half_wedge_deg=22.0,
-    unguided_turning_deg=7.0,
     leading_edge_radius_mm=3.7,
-    trailing_edge_radius_mm=0.7,
     throat_mm=12.1,
 )
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class GuideVaneSegment:
     """All sizes of a guide-vane segment; the defaults are a high-pressure turbine's doublet.
 
@@ -246,9 +239,8 @@ def _vane_rings(segment: GuideVaneSegment) -> np.ndarray:
         axial, tangential = contour.T
         # rows between the cylinder inside and the cone outside lean with both
         lean = span * (segment.outer_wall_radius_mm(axial) - segment.outer_radius_mm)
-        rings.append(
-            np.stack([axial, tangential / radius, segment.inner_radius_mm + place + lean], -1)
-        )
+        height_mm = segment.inner_radius_mm + place + lean
+        rings.append(np.stack([axial, tangential / radius, height_mm], -1))
     return np.stack(rings)
 
 

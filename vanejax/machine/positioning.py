@@ -213,20 +213,15 @@ def motion_errors(
     return MotionErrors(center, carried, -carried, calibration)
 
 
-def twist_gradient(rotation: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """[3] rad per rad: how `twist_about`'s angle changes with a small rotation after it.
+def angle_sigma_deg(covariance: np.ndarray, rotation: np.ndarray, axis: np.ndarray) -> float:
+    """Standard deviation of `twist_about`'s angle, from a motion's covariance [6, 6].
 
-    With the quaternion (q0, q): ``(q0 (q0 a + q x a) + (q . a) q) / (q0^2 + (q . a)^2)``; of a
-    rotation about the axis a itself, a.
+    With the quaternion (q0, q), a small rotation afterwards changes the angle by its product with
+    ``(q0 (q0 a + q x a) + (q . a) q) / (q0^2 + (q . a)^2)``: a, of a rotation about the axis a.
     """
     real, along, imaginary, axis = _about(rotation, axis)
     turned_axis = real * axis + np.cross(imaginary, axis)
-    return (real * turned_axis + along * imaginary) / (real**2 + along**2)
-
-
-def angle_sigma_deg(covariance: np.ndarray, rotation: np.ndarray, axis: np.ndarray) -> float:
-    """Standard deviation of the angle about an axis, from a motion's covariance [6, 6]."""
-    gradient = twist_gradient(rotation, axis)
+    gradient = (real * turned_axis + along * imaginary) / (real**2 + along**2)
     return float(np.degrees(np.sqrt(gradient @ covariance[:3, :3] @ gradient)))
 
 
