@@ -46,25 +46,6 @@ def cloud(*shape: int, seed: int = 1) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=shape) * np.geomspace(0.1, 10, shape[-1])
 
 
-def run(layer, params, x, mask):
-    return jax.jit(layer.apply)({"params": params}, x, mask)
-
-
-def test_single_precision_agrees_too():
-    """The moments of the narrow input lose few digits, even beside a bias of 3."""
-    params = jax.tree.map(np.float32, parameters())
-    x = cloud(N, K, C).astype(np.float32)
-    for layer, reduce in (
-        (DenseNormRelu(FEATURES), lambda y: y),
-        (DenseNormReluMax(FEATURES), lambda y: y.max(axis=1)),
-    ):
-        with jax.enable_x64(False):
-            found = run(layer, params, x, np.ones(N, bool))
-        assert found.dtype == jnp.float32
-        expected = reduce(torch_layer(x.astype(float), parameters(), 8))
-        np.testing.assert_allclose(found, expected, atol=2e-5)  # f32 eps x 160
-
-
 LAYERS = [  # with the shape of an input, and what a layer does to all activations
     # narrow inputs go through their moments, wide ones do not
     *((DenseNormRelu, (*rows, width), lambda y: y)
@@ -74,12 +55,21 @@ LAYERS = [  # with the shape of an input, and what a layer does to all activatio
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("num_groups", [1, 8, FEATURES])
+@pytest.mark.parametrize(
+    ("num_groups", "dtype", "atol"),
+    [
+        # the variance is a difference of moments of inputs up to 10: eps x 100 x 16
+        *((count, np.float64, 10 * EXACT) for count in (1, 8, FEATURES)),
+        (8, np.float32, 2e-5),
+    ],
+)
 @pytest.mark.parametrize(("layer", "shape", "reduce"), LAYERS)
-def test_a_layer_is_torch_s_and_padding_has_no_gradient(layer, shape, reduce, num_groups):
+def test_a_layer_is_torch_s_and_padding_has_no_gradient(
+    layer, shape, reduce, num_groups, dtype, atol
+):
     mask = np.random.default_rng(20).permutation(np.arange(shape[0] + 20) < shape[0])
-    x, params = cloud(*shape), parameters(shape[-1])
-    padded = np.full((len(mask), *shape[1:]), 1e4)
+    x, params = jax.tree.map(dtype, (cloud(*shape), parameters(shape[-1])))
+    padded = np.full((len(mask), *shape[1:]), 1e4, dtype)
     padded[mask] = x
     real = ... if layer is DenseNormReluCloudMax else np.flatnonzero(mask)
 
@@ -87,10 +77,11 @@ def test_a_layer_is_torch_s_and_padding_has_no_gradient(layer, shape, reduce, nu
         y = layer(FEATURES, num_groups).apply({"params": params}, padded, mask)
         return jnp.sum(y[real] ** 2), y
 
-    (_, found), gradient = jax.jit(jax.value_and_grad(total, has_aux=True))(padded)
-    expected = reduce(torch_layer(x, params, num_groups))
-    # the variance is a difference of moments of inputs up to 10: eps x 100 x 16
-    np.testing.assert_allclose(found[real], expected, atol=10 * EXACT)
+    with jax.enable_x64(dtype is np.float64):
+        (_, found), gradient = jax.jit(jax.value_and_grad(total, has_aux=True))(padded)
+    assert found.dtype == dtype
+    exact = jax.tree.map(np.float64, (x, params))
+    np.testing.assert_allclose(found[real], reduce(torch_layer(*exact, num_groups)), atol=atol)
     assert np.isfinite(found).all()
     np.testing.assert_array_equal(gradient[~mask], 0)
     assert np.abs(gradient[mask]).max() > 0
