@@ -20,6 +20,12 @@ MIDDLE = Camera(width=400, height=320)  # with 14,000
 VIEW = 103  # of the 216: 70 deg of elevation
 
 
+def solid(*meshes: trimesh.Trimesh, name: str = "solid") -> Part:
+    """Meshes as one part."""
+    mesh = trimesh.util.concatenate(meshes)
+    return part_from_mesh(mesh.vertices, mesh.faces, name=name)
+
+
 @functools.cache
 def vane() -> Part:
     return guide_vane()
@@ -35,13 +41,12 @@ def box(x: float = 80.0, y: float = 50.0, z: float = 30.0) -> Part:
 @functools.cache
 def bracket() -> Part:
     """An angle with legs of 80 and 50 mm and a boss at one corner: no symmetry at all."""
-    solids = [
+    legs_and_boss = [
         trimesh.creation.box(bounds=[[0, 0, 0], [80, 40, 10]]),
         trimesh.creation.box(bounds=[[0, 0, 0], [10, 40, 50]]),
         trimesh.creation.box(bounds=[[60, 5, 0], [75, 20, 25]]),
     ]
-    mesh = trimesh.boolean.union(solids)
-    return part_from_mesh(mesh.vertices, mesh.faces, name="bracket")
+    return solid(trimesh.boolean.union(legs_and_boss), name="bracket")
 
 
 @functools.cache

@@ -22,6 +22,16 @@ def scattered(values: np.ndarray, rows: int, junk: float | np.ndarray) -> tuple:
     return full, np.isin(np.arange(rows), place)
 
 
+def bumpy_sphere(source: int, target: int, bump: float = 0.1) -> tuple[np.ndarray, ...]:
+    """Two views: source xyz and normals [N, 3], turned and moved, and the target's [M, 3]; f64."""
+    normals = np.random.default_rng(0).normal(size=(source + target, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    xyz = normals * (0.6 + bump * np.sin(5 * normals[:, :1]))
+    turn = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
+    moved = xyz[:source] @ turn.T + [0.1, 0, -0.1]
+    return moved, normals[:source] @ turn.T, xyz[source:], normals[source:]
+
+
 def cloud(xyz: np.ndarray, rows: int | None = None, junk: float = 30.0) -> PointCloud:
     """A cloud for networks that look at no normals, its padding scattered among the points."""
     xyz, mask = scattered(xyz, len(xyz) if rows is None else rows, junk)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.special
-from network_clouds import assert_reached_but_no_padding, assert_same, scattered
+from network_clouds import assert_reached_but_no_padding, assert_same, bumpy_sphere, scattered
 from published_rpmnet import state_dict
 from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
@@ -33,14 +33,8 @@ def variables(dtype: type = np.float32) -> dict:
     return jax.tree.map(dtype, rpmnet_variables(state_dict()))
 
 
-@functools.cache
 def problem() -> tuple[np.ndarray, ...]:
-    """Two views of a bumpy sphere: source xyz and normals [N, 3], target's [M, 3]; f64."""
-    normals = np.random.default_rng(0).normal(size=(N + M, 3))
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    xyz = normals * (0.6 + 0.1 * np.sin(5 * normals[:, :1]))
-    turn = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
-    return xyz[:N] @ turn.T + [0.1, 0, -0.1], normals[:N] @ turn.T, xyz[N:], normals[N:]
+    return bumpy_sphere(N, M)
 
 
 def cloud(xyz: np.ndarray, normals: np.ndarray, rows: int) -> PointCloud:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.spatial
 import trimesh
+from example_scans import solid
 
 from vanejax.cad import Part, part_from_mesh
 from vanejax.errors import InputError
@@ -18,11 +19,6 @@ OBLIQUE = look_at(400 * np.array([0.43301, 0.25, 0.86603]), ORIGIN)  # elevation
 # half a unit in the last place of a float32 between 256 and 512 is 1.5e-5 mm; three coordinates
 ROUNDING_MM = 5e-5
 ARRAYS = ("points", "normals", "range_mm", "face", "incidence_deg", "pixel", "hidden")
-
-
-def solid(*meshes: trimesh.Trimesh) -> Part:
-    mesh = trimesh.util.concatenate(meshes)
-    return part_from_mesh(mesh.vertices, mesh.faces, name="test")
 
 
 def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -303,11 +299,11 @@ def test_a_camera_that_sees_nothing_says_why(ring):
 
 def test_a_camera_inside_the_part_is_refused():
     scanner = Scanner(solid(trimesh.creation.icosphere(2, 1000.0)))
-    with pytest.raises(InputError, match="inside the part test"):
+    with pytest.raises(InputError, match="inside the part solid"):
         scanner.scan(Camera(), ABOVE)
     with pytest.MonkeyPatch.context() as patch:  # the largest face need not be in the first chunk
         patch.setattr("vanejax.scanner.virtual_scanner.FACES_AT_ONCE", 7)
-        with pytest.raises(InputError, match="inside the part test"):
+        with pytest.raises(InputError, match="inside the part solid"):
             scanner.scan(Camera(), ABOVE)
     # in the hole of a ring it is not inside, though within the part's bounding sphere
     ring = Scanner(solid(trimesh.creation.torus(400, 50)))

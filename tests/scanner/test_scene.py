@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scipy.spatial
 import trimesh
-from example_scans import SMALL, VIEW, bracket, vane
+from example_scans import SMALL, VIEW, bracket, solid, vane
 
-from vanejax.cad import Part, part_from_mesh
+from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
 from vanejax.scanner import Scanner, hemisphere_viewpoints
@@ -114,7 +114,7 @@ def test_jaws_touch_the_part_from_the_side_and_hide_some_of_it():
 
 def test_chips_lie_on_something_and_in_nothing():
     box = trimesh.creation.box(bounds=[[-40, -30, 0], [40, 30, 20]])
-    part = part_from_mesh(box.vertices, box.faces, name="box")
+    part = solid(box)
     plate = table(part)
     below = ClutterScene(part, (plate,)).scanner()
     found = chips(below, part, np.random.default_rng(3), 40)
@@ -135,8 +135,7 @@ def test_chips_lie_on_something_and_in_nothing():
 
 def test_drops_sit_on_a_sphere_along_its_normal():
     """On a sphere of 50 mm the top of a cap lies on the line through the sphere's middle."""
-    ball = trimesh.creation.icosphere(5, 50.0)
-    part = part_from_mesh(ball.vertices, ball.faces, name="ball")
+    part = solid(trimesh.creation.icosphere(5, 50.0))
     found = coolant_drops(Scanner(part), part, np.random.default_rng(1), 30)
     assert len(found) == 30
     for drop in found:

@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
+from example_scans import solid
 from scipy.special import erf
 
-from vanejax.cad import Part, guide_vane, part_from_mesh
+from vanejax.cad import guide_vane
 from vanejax.errors import InputError
 from vanejax.scanner import (
     Camera,
@@ -28,15 +29,14 @@ CAMERA = Camera(width=320, height=256, near_mm=100.0)
 ABOVE = look_at(np.array([0.0, 0.0, 400.0]), np.zeros(3))
 
 
-def solid(*bounds: tuple) -> Part:
-    mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=b) for b in bounds])
-    return part_from_mesh(mesh.vertices, mesh.faces, name="test")
+def boxes(*bounds: tuple) -> Scanner:
+    return Scanner(solid(*(trimesh.creation.box(bounds=b) for b in bounds)))
 
 
 @pytest.fixture(scope="module")
 def plate() -> Scanner:
     """A plate whose upper face is z = 0, 400 mm below the camera; no noise is absorbed by edges."""
-    return Scanner(solid(((-90, -60, -4), (90, 60, 0))))
+    return boxes(((-90, -60, -4), (90, 60, 0)))
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +46,7 @@ def vane() -> Scanner:
 
 @pytest.fixture(scope="module")
 def ball() -> Scanner:
-    mesh = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
-    return Scanner(part_from_mesh(mesh.vertices, mesh.faces, name="ball"))
+    return Scanner(solid(trimesh.creation.icosphere(subdivisions=4, radius=50.0)))
 
 
 def take(scanner: Scanner, sensor: Sensor, *, seed: int = 0, pose=ABOVE) -> Measurement:
@@ -86,7 +85,7 @@ def test_a_preset_is_deterministic_and_seeded(name, vane):
 
 def test_the_shadow_ends_where_the_projector_s_ray_over_the_edge_lands():
     """A block 20 mm high ends at x = -20; the projector stands at x = +120 - or at -120."""
-    scanner = Scanner(solid(((-90, -60, -4), (90, 60, 0)), ((-40, -60, -1), (-20, 60, 20))))
+    scanner = boxes(((-90, -60, -4), (90, 60, 0)), ((-40, -60, -1), (-20, 60, 20)))
     for baseline, edge, inward in ((120.0, -40.0, -1), (-120.0, -20.0, 1)):
         scan = take(scanner, Sensor(camera=CAMERA, baseline_mm=baseline, shadow=True))
         points = ABOVE.inverse().apply(scan.ideal.points.astype(np.float64))
@@ -173,7 +172,7 @@ def test_errors_lie_along_the_pixel_s_ray(plate):
 
 
 def test_mixed_pixels_lie_at_depth_edges_between_both_surfaces():
-    scanner = Scanner(solid(((-90, -60, -4), (90, 60, 0)), ((-20, -20, -1), (20, 20, 30))))
+    scanner = boxes(((-90, -60, -4), (90, 60, 0)), ((-20, -20, -1), (20, 20, 30)))
     scan = take(scanner, Sensor(camera=CAMERA, flying_pixel_rate=1.0, jump_mm=5.0))
     error = depth_error(scan)
     moved = np.abs(error) > 1e-3
@@ -243,7 +242,7 @@ def test_the_paper_s_camera_keeps_the_accuracy_of_its_table():
     """0.1 mm at 300 and 1 mm at 1300 mm, read as a bound on 95 % of the errors; not far below."""
     for z, bound in ((300.0, 0.1), (1300.0, 1.0)):
         half = z / 8
-        scanner = Scanner(solid(((-half, -half, -4), (half, half, 0))))
+        scanner = boxes(((-half, -half, -4), (half, half, 0)))
         pose = look_at(np.array([0.0, 0.0, z]), np.zeros(3))
         sensor = dataclasses.replace(
             preset("paper_camera"), flying_pixel_rate=0.0, outlier_rate=0.0
@@ -310,7 +309,7 @@ def roof(slope: float) -> Scanner:
     mesh = trimesh.convex.convex_hull(
         [(x, y, z) for x, z in ((-60, -60 * slope), (60, -60 * slope), (0, 0)) for y in (-40, 40)]
     )
-    return Scanner(part_from_mesh(mesh.vertices, mesh.faces, name="roof"))
+    return Scanner(solid(mesh))
 
 
 def test_a_matching_window_rounds_a_ridge_off():

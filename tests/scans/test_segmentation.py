@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from example_scans import bracket, measured_points, random_view, vane, with_noise
+from example_scans import bracket, measured_points, random_view, solid, vane, with_noise
 
-from vanejax.cad import Part, part_from_mesh
+from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.scanner import Camera, hemisphere_viewpoints
 from vanejax.scanner.clutter import Clutter, ClutterObject, ClutterScene, clutter_scene, table
@@ -28,8 +28,7 @@ def seen(scene: ClutterScene, view: int = 103, seed: int = 0) -> tuple[np.ndarra
 
 
 def plate(x: float = 100.0, y: float = 80.0, z: float = 5.0) -> Part:
-    mesh = trimesh.creation.box((x, y, z))
-    return part_from_mesh(mesh.vertices, mesh.faces, name="plate")
+    return solid(trimesh.creation.box((x, y, z)))
 
 
 def share(labels: np.ndarray, segment: Segment) -> float:
@@ -132,9 +131,9 @@ def test_moving_or_sorting_the_scan_changes_hardly_anything():
 
 def test_the_largest_slab_of_a_box_is_its_largest_face():
     """With 1 mm to either side, strips of its walls count, and planes that are a little tilted."""
-    mesh = trimesh.creation.box((80.0, 50.0, 30.0))
-    part = part_from_mesh(mesh.vertices, mesh.faces, name="box")
-    assert largest_slab_mm2(part, 1.0) == pytest.approx(80 * 50 + 2 * (80 + 50), rel=0.08)
+    assert largest_slab_mm2(plate(80.0, 50.0, 30.0), 1.0) == pytest.approx(
+        80 * 50 + 2 * (80 + 50), rel=0.08
+    )
     # both faces of a sheet
     assert largest_slab_mm2(plate(z=1.0), 1.0) == pytest.approx(2 * 100 * 80, rel=0.05)
 

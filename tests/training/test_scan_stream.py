@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from example_scans import solid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vanejax.cad.part import Part, part_from_mesh
+from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.pointcloud import PointCloud
 from vanejax.scanner import Camera, Scanner, Sensor, preset
@@ -27,8 +28,7 @@ SAMPLING = PairSampling(num_reference=256, num_source=200, noise=0.0)
 
 @pytest.fixture(scope="module")
 def box() -> Part:
-    mesh = trimesh.creation.box(bounds=[CENTER - HALF, CENTER + HALF])
-    return part_from_mesh(mesh.vertices, mesh.faces, name="box")
+    return solid(trimesh.creation.box(bounds=[CENTER - HALF, CENTER + HALF]))
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +131,7 @@ def test_as_many_points_as_the_part_s_share(stream):
 
 
 def test_a_casting_is_scanned_and_the_cad_s_pose_is_the_label(stream, box):
-    mesh = trimesh.creation.box(bounds=[CENTER - HALF - 1, CENTER + HALF + 1])
-    cast = part_from_mesh(mesh.vertices, mesh.faces, name="cast")
+    cast = solid(trimesh.creation.box(bounds=[CENTER - HALF - 1, CENTER + HALF + 1]))
     points, _ = dataclasses.replace(stream, castings=[Scanner(cast)]).scan(0)
     np.testing.assert_allclose(off_the_box_mm(points, box), 1.0, atol=2e-3)
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from example_scans import solid
 from scipy.spatial.transform import Rotation
 
 from experiments.configs.smoke import get_config
@@ -284,10 +285,6 @@ def pretrained(part: Part) -> TrainedMatcher:
     return find_weights("pretrained", part)
 
 
-def part_of(mesh: trimesh.Trimesh, name: str) -> Part:
-    return part_from_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), name=name)
-
-
 def test_the_file_says_what_it_is(pretrained: TrainedMatcher, part: Part) -> None:
     assert pretrained.part_name == part.name
     trained = pretrained.trained
@@ -305,7 +302,7 @@ def test_it_knows_the_part_in_other_files(pretrained: TrainedMatcher, part: Part
     rounded = part.mesh.copy()
     rounded.vertices = np.round(rounded.vertices, 3)  # as a text file may have it
     for mesh in (rounded, part.mesh.subdivide()):
-        again = part_of(mesh, "again")
+        again = solid(mesh, name="again")
         assert again.sha256 != part.sha256
         assert pretrained.knows(again)
 
@@ -335,7 +332,7 @@ def test_it_knows_no_other_part(pretrained: TrainedMatcher, part: Part, change: 
         middle = part.center + np.array([48.0, -18.0, -15.0])
         block = trimesh.creation.box(bounds=[middle - 5.0, middle + 5.0])
         mesh = trimesh.util.concatenate([mesh, block])
-    other = part_of(mesh, change)
+    other = solid(mesh, name=change)
     if change == "more":
         assert (other.center == part.center).all()
         assert other.radius == part.radius
@@ -380,7 +377,7 @@ def test_the_command_takes_them_by_name(part: Part, tmp_path: Path, capsys, monk
     command = ["register", scan, "vane", "--weights", "shipped", "--json", "pose.json"]
     assert main([*command, "--quiet"]) == 0
     assert json.loads(Path("pose.json").read_text())["weights"] == "shipped"
-    box = part_of(part.mesh.convex_hull, "box")
+    box = solid(part.mesh.convex_hull, name="box")
     box.export("box.stl")
     assert main(["register", scan, "box.stl", "--weights", "pretrained"]) == 2
     assert "no pretrained weights for box" in capsys.readouterr().err

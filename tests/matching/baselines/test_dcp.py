@@ -8,7 +8,14 @@ import jax
 import numpy as np
 import pytest
 import scipy.special
-from network_clouds import assert_reached_but_no_padding, assert_same, cloud, pose, pose_gradient
+from network_clouds import (
+    assert_reached_but_no_padding,
+    assert_same,
+    bumpy_sphere,
+    cloud,
+    pose,
+    pose_gradient,
+)
 from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
 
@@ -21,12 +28,7 @@ EXACT = 1e-9  # f64 eps x the network's condition of about 1e5
 
 
 def problem() -> tuple[np.ndarray, np.ndarray]:
-    """Two samples of a bumpy sphere, the first moved; f64."""
-    normals = np.random.default_rng(0).normal(size=(N + M, 3))
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    xyz = normals * (0.6 + 0.2 * np.sin(5 * normals[:, :1]))
-    turn = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
-    return xyz[:N] @ turn.T + [0.1, 0, -0.1], xyz[N:]
+    return bumpy_sphere(N, M, bump=0.2)[::2]
 
 
 @functools.cache
