@@ -34,8 +34,7 @@ CORNERS = np.array([[0, 0, 0], [70, 0, 0], [0, 60, 0], [0, 0, 50.0]])
 
 
 @pytest.fixture(autouse=True)
-def _no_cache(monkeypatch) -> None:
-    monkeypatch.setenv("VANEJAX_CACHE_DIR", "off")
+def _colors(monkeypatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
 
 
@@ -199,11 +198,8 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
     ("arguments", "words"),
     [
         ([], "COMMAND"),
-        (["regsiter"], "invalid choice: 'regsiter'"),
         (["register", "scan.ply"], "required: CAD"),
         (["register", "scan.ply", "wedge.stl", "--iint", "x"], "unrecognized arguments: --iint"),
-        (["register", "scan.ply", "wedge.stl", "--seed", "x"], "invalid int value: 'x'"),
-        (["register", "scan.ply", "wedge.stl", "--json"], "--json: expected one argument"),
         (["register", "none.ply", "wedge.stl"], "none.ply: no such file"),
         (["register", "scan.ply", "none.stl"], "none.stl: no such file"),
         (["register", "text.docx", "wedge.stl"], "text.docx: .*docx"),
@@ -220,8 +216,6 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
         (["register", "scan.ply", "wedge.stl", "--sensor-origin", "1,2"], "should be X,Y,Z"),
         (["register", "scan.ply", "wedge.stl", "--sensor-origin", "1,2,nan"], "should be X,Y,Z"),
         (["register", "scan.ply", "wedge.stl", "--json", "no/out.json"], "No such file or direct"),
-        (["register", "scan.ply", "wedge.stl", "--json", "."], "is a folder"),
-        (["register", "scan.ply", "wedge.stl", "--json", "/dev/null"], "is a device"),
         (["register", "scan.ply", "wedge.stl", "--json", "./scan.ply"], "is SCAN already"),
         (["register", "scan.ply", "wedge.stl", "--report", "no/out.html"], "No such file or dir"),
         (["register", "scan.ply", "wedge.stl", "--report", "out.pdf"], "should end in .html"),
@@ -241,7 +235,6 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
         (["scan", "wedge.stl", "--out", "new", "--noise-mm", "-1"], "--noise-mm -1.0: should be"),
         (["scan", "wedge.stl", "--out", "new", "--noise-mm", "nan"], "--noise-mm nan: should be"),
         (["scan", "wedge.stl", "--out", "new", "--seed", "-1"], "--seed -1: should be 0 or more"),
-        (["scan", "wedge.stl", "--out", "new", "--format", "las"], "invalid choice: 'las'"),
         (["scan", "wedge.stl", "--out", "new", "--resolution", "0"], "must be positive"),
         (["inspect", "none.ply"], "none.ply"),
         (["export", "."], "run.json: no such file"),
@@ -271,25 +264,16 @@ def test_bad_input_is_one_line_and_no_work(
     assert left == before
 
 
-@pytest.mark.parametrize(
-    ("trouble", "code", "words"),
-    [
-        (KeyboardInterrupt(), 130, "vanejax: interrupted\n"),
-        (
-            OSError(errno.ENOSPC, "No space left on device", "/tmp/x"),
-            1,
-            "vanejax: error: /tmp/x: No space left on device\n",
-        ),
-        (MemoryError(), 1, "vanejax: error: not enough memory\n"),
-    ],
-)
-def test_trouble_on_the_way_is_one_line(files, fake, capsys, trouble, code, words) -> None:
-    fake(trouble)
-    assert register(files) == code
-    assert capsys.readouterr().err == words
-
-
-def test_a_bug_is_not_hidden(files, fake) -> None:
+def test_trouble_on_the_way_is_one_line_and_a_bug_is_not_hidden(files, fake, capsys) -> None:
+    full = OSError(errno.ENOSPC, "No space left on device", "/tmp/x")
+    for trouble, code, words in (
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (full, 1, "error: /tmp/x: No space left on device"),
+        (MemoryError(), 1, "error: not enough memory"),
+    ):
+        fake(trouble)
+        assert register(files) == code
+        assert capsys.readouterr().err == f"vanejax: {words}\n"
     fake(ZeroDivisionError())
     with pytest.raises(ZeroDivisionError):
         register(files)
@@ -303,6 +287,13 @@ def distance_from_planes(points: np.ndarray) -> np.ndarray:
     return np.abs(np.einsum("fi,nfi->nf", normals, points[:, None] - a[None]))
 
 
+def scanned(files: Path, out: Path, *options: str) -> tuple[dict[str, Any], list[Any]]:
+    """Labels and scans that the command makes of the wedge."""
+    arguments = ["scan", str(files / "wedge.stl"), "--out", str(out), "--quiet", *options]
+    assert main(arguments) == 0
+    return scans_of(out)
+
+
 def scans_of(folder: Path) -> tuple[dict[str, Any], list[Any]]:
     labels = json.loads((folder / "labels.json").read_text())
     return labels, [load_scan(folder / row["file"], units="mm") for row in labels["views"]]
@@ -310,12 +301,10 @@ def scans_of(folder: Path) -> tuple[dict[str, Any], list[Any]]:
 
 def test_scans_lie_on_the_part_where_the_labels_say(files, tmp_path, wedge, capsys) -> None:
     out = tmp_path / "new" / "scans"
-    arguments = ["scan", str(files / "wedge.stl"), "--out", str(out), "--resolution", "0.1"]
-    assert main([*arguments, "--views", "0,5,100", "--quiet"]) == 0
+    labels, scans = scanned(files, out, "--resolution", "0.1", "--views", "0,5,100")
     printed = capsys.readouterr()
     assert printed.err == ""
     assert f"{out}: 3 scans of wedge, " in printed.out
-    labels, scans = scans_of(out)
     assert {path.name for path in out.iterdir()} == {
         "labels.json",
         *(f"view_{view:03d}.ply" for view in (0, 5, 100)),
@@ -336,10 +325,8 @@ def test_scans_lie_on_the_part_where_the_labels_say(files, tmp_path, wedge, caps
 
 def test_noise_is_along_the_ray_and_repeatable(files, tmp_path, wedge) -> None:
     def run(name: str, *options: str) -> np.ndarray:
-        arguments = ["scan", str(files / "wedge.stl"), "--out", str(tmp_path / name), "--quiet"]
-        arguments += ["--views", "100,", "--resolution", "0.3", "--format", "npz", *options]
-        assert main(arguments) == 0
-        return scans_of(tmp_path / name)[1][0].points
+        view = ("--views", "100,", "--resolution", "0.3", "--format", "npz")
+        return scanned(files, tmp_path / name, *view, *options)[1][0].points
 
     clean = run("clean")
     noisy = run("noisy", "--noise-mm", "0.5")
@@ -358,9 +345,8 @@ def test_noise_is_along_the_ray_and_repeatable(files, tmp_path, wedge) -> None:
 
 @pytest.mark.parametrize("suffix", ["ply", "npz", "xyz", "pcd"])
 def test_every_format_is_read_again(files, tmp_path, suffix: str) -> None:
-    arguments = ["scan", str(files / "wedge.stl"), "--out", str(tmp_path / "scans"), "--quiet"]
-    assert main([*arguments, "--views", "2", "--resolution", "0.1", "--format", suffix]) == 0
-    labels, scans = scans_of(tmp_path / "scans")
+    options = ("--views", "2", "--resolution", "0.1", "--format", suffix)
+    labels, scans = scanned(files, tmp_path / "scans", *options)
     assert [row["file"] for row in labels["views"]] == [f"view_000.{suffix}", f"view_215.{suffix}"]
     assert [row["points"] for row in labels["views"]] == [len(scan.points) for scan in scans]
 
@@ -432,13 +418,8 @@ def test_export_says_what_it_wrote(monkeypatch, tmp_path, capsys) -> None:
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "vanejax", *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=100,
-    )
+    command = [sys.executable, "-m", "vanejax", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
 
 
 def test_as_a_process_it_fails_in_one_line() -> None:
@@ -449,19 +430,13 @@ def test_as_a_process_it_fails_in_one_line() -> None:
     assert done.stderr.count("\n") == 1
 
 
-def test_help_and_version_need_nothing_heavy() -> None:
+def test_help_and_version() -> None:
     done = run("--help")
     assert (done.returncode, done.stderr) == (0, "")
     for name in ("register", "scan", "inspect", "export", "exit codes"):
         assert name in done.stdout
     done = run("--version")
     assert (done.returncode, done.stdout[:8]) == (0, "vanejax ")
-    program = "import sys; from vanejax.cli import program; program.main(['register', '--help'])"
-    program += "; print(sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
-    assert "--sensor-origin" in done.stdout
-    for heavy in ("numpy", "jax", "trimesh", "scipy", "matplotlib"):
-        assert f"'{heavy}'" not in done.stdout
 
 
 def modules_after(program: str, folder: Path) -> set[str]:
@@ -475,8 +450,12 @@ def modules_after(program: str, folder: Path) -> set[str]:
     return set(done.stdout.splitlines()[-1].split())
 
 
-def test_importing_the_package_loads_nothing_heavy(tmp_path) -> None:
-    loaded = modules_after("import vanejax", tmp_path)
+@pytest.mark.parametrize(
+    "program",
+    ["import vanejax", "from vanejax.cli import program; program.main(['register', '--help'])"],
+)
+def test_the_package_and_help_load_nothing_heavy(program, tmp_path) -> None:
+    loaded = modules_after(program, tmp_path)
     assert "vanejax" in loaded
     assert not loaded & {"numpy", "scipy", "jax", "flax", "trimesh", "matplotlib"}
 

@@ -220,7 +220,6 @@ def test_every_command_of_the_page_gives_what_it_shows(tmp_path: Path, monkeypat
     """
     monkeypatch.chdir(tmp_path)
     environment = os.environ | {"PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
-    environment |= {"VANEJAX_CACHE_DIR": "off"}
     blocks = re.findall(r"^```(sh|python|text)\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
     shown, printed, commands = 0, None, []
     for language, block in blocks:

@@ -351,7 +351,6 @@ LONG = ("register scan.ply block.stl", "experiments.", "export", "--weights", "p
 @pytest.mark.slow
 def test_the_quick_start_runs_as_written(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("VANEJAX_CACHE_DIR", "off")
     page = (ROOT / "docs" / "quick_start.md").read_text()
     run, verdicts = 0, 0
     printed = ""

@@ -33,7 +33,6 @@ def test_it_is_short_and_starts_with_the_picture_and_the_two_commands() -> None:
 
 def test_the_commands_register_a_scan(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("VANEJAX_CACHE_DIR", "off")
     (block,) = [b for b in blocks("sh") if "vanejax register" in b]
     commands = [
         shlex.split(line, comments=True)[1:]

@@ -7,9 +7,7 @@ import dataclasses
 import hashlib
 import html.parser
 import json
-import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -94,21 +92,18 @@ def evil(tmp_path_factory) -> Path:
 # ---------------------------------------------------------------- words
 
 
-@pytest.mark.parametrize(
-    ("status", "advice"),
-    [
+def test_the_verdict_comes_first(reports):
+    for status, advice in (
         ("accepted", "The scan confirms this pose."),
         ("ambiguous", "Do not machine before it is decided."),
         ("rejected", "Do not use this pose."),
-    ],
-)
-def test_the_verdict_comes_first(status, advice, reports):
-    page = Page(reports[status])
-    title = f"{status.capitalize()}: casting_0417 on guide-vane segment"
-    assert page.text.strip().startswith(title)
-    assert advice in page.text
-    assert f"made up to be {status}" in page.text
-    assert ("body", {"class": status}) in page.elements
+    ):
+        page = Page(reports[status])
+        title = f"{status.capitalize()}: casting_0417 on guide-vane segment"
+        assert page.text.strip().startswith(title)
+        assert advice in page.text
+        assert f"made up to be {status}" in page.text
+        assert ("body", {"class": status}) in page.elements
 
 
 def test_ambiguous_without_another_pose_does_not_speak_of_one(tmp_path):
@@ -167,9 +162,8 @@ def test_the_truth_is_compared_where_it_is_known(reports):
 
 def test_what_is_unknown_is_said_to_be(tmp_path):
     case = example_registration()
-    nothing = np.nan
     verification = dataclasses.replace(
-        case.result.verification, violation_share=nothing, unmeasured_share=nothing
+        case.result.verification, violation_share=np.nan, unmeasured_share=np.nan
     )
     uncertainty = dataclasses.replace(
         case.result.uncertainty,
@@ -185,13 +179,12 @@ def test_what_is_unknown_is_said_to_be(tmp_path):
         case, scan=dataclasses.replace(case.scan, sensor_origin=None, notes=())
     )
     text = Page(write(case, tmp_path, truth=case.truth)).text
-    assert "place unknown" in text
-    assert "The sensor's place is unknown, so its rays are too" in text
-    assert "undetermined" in text
-    assert "no single direction" in text
-    assert re.search(r"Behind it .{0,80} unknown", text)
-    assert re.search(r"Unmeasured .{0,80} unknown", text)
-    assert "Nothing was assumed, dropped or repaired." in text
+    for words in (
+        "place unknown", "The sensor's place is unknown, so its rays are too", "undetermined",
+        "no single direction", "Behind it .{0,80} unknown", "Unmeasured .{0,80} unknown",
+        "Nothing was assumed, dropped or repaired.",
+    ):  # fmt: skip
+        assert re.search(words, text), words
     assert not re.search(r"\b(nan|inf|None)\b", text)
 
 
@@ -246,16 +239,15 @@ def test_numbers_and_directions_in_words(shown, expected):
 # ---------------------------------------------------------------- the file
 
 
-def test_nothing_is_fetched(written):
+def test_one_file_fetches_nothing(written):
+    assert list(written.parent.iterdir()) == [written]
     page = Page(written)
     for tag, attributes in page.elements:
         assert tag not in ("iframe", "object", "embed", "base", "form"), tag
         for name in ("src", "href", "srcset", "data", "action", "poster", "background"):
             value = attributes.get(name)
             assert value is None or value.startswith("data:"), (tag, name, value)
-    assert not re.search(
-        r"(https?|wss?|ftp):|//[a-z]", page.source.replace("\n", " "), re.I
-    ) or all(line.strip().startswith("//") for line in re.findall(r"^\s*//.*$", page.source, re.M))
+    assert not re.search(r"(https?|wss?|ftp):", page.source, re.I)
     assert "url(" not in page.code["style"]
     assert "@import" not in page.code["style"]
 
@@ -286,21 +278,6 @@ def test_names_and_notes_are_words_not_code(evil, written):
     assert page.code["script"] == tame.code["script"]
     assert page.text.count(EVIL) >= 5  # title, heading, reason, notes, time, provenance
     assert all(a["src"].startswith("data:") for t, a in page.elements if t == "img")
-
-
-def test_the_file_appears_complete_or_not_at_all(written, tmp_path, monkeypatch):
-    assert list(written.parent.iterdir()) == [written]
-    path = tmp_path / "report.html"
-    path.write_text("the old one")
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(InputError, match=r"report\.html: cannot be written: No space left"):
-        write(example_registration(), tmp_path)
-    assert path.read_text() == "the old one"
-    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
 def test_what_cannot_be_written_is_refused(tmp_path):
@@ -389,9 +366,7 @@ def test_a_large_part_is_simplified():
     assert (faces[:, 0] != faces[:, 1]).all()
     assert faces.max() < len(vertices)
     same, _, none = simplified(np.asarray(sphere.vertices), np.asarray(sphere.faces))
-    assert none == 0
-    assert same is not None
-    assert len(same) == len(sphere.vertices)
+    assert (len(same), none) == (len(sphere.vertices), 0)
 
 
 @pytest.mark.slow
@@ -404,14 +379,6 @@ def test_a_report_of_a_large_part_stays_small(tmp_path):
 
 
 # ---------------------------------------------------------------- in a browser
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[HeadlessBrowser]:
-    if CHROMIUM is None:
-        pytest.skip("no chromium or google-chrome on the PATH")
-    with HeadlessBrowser() as running:
-        yield running
 
 
 BOX = "(({x, y, width, height}) => ({x: x + scrollX, y: y + scrollY, width, height}))"

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
 import re
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from example_registration import example_registration
-from headless_browser import CHROMIUM, HeadlessBrowser
+from headless_browser import HeadlessBrowser
 from matplotlib.colors import to_rgb
+from test_report import decoded, placed
 
 from vanejax.cad import guide_vane
 from vanejax.errors import InputError
@@ -41,25 +40,18 @@ def scene(view: View3d) -> dict:
     return json.loads(re.search(r'<script type="application/json".*?>(.*?)</script>', view.page)[1])
 
 
-def placed(grid: str, matrix: list[float]) -> np.ndarray:
-    """What WebGL makes of 16-bit positions and a column-major matrix: points [N, 3]."""
-    share = np.frombuffer(base64.b64decode(grid), "<u2").reshape(-1, 3) / 65535
-    model = np.reshape(matrix, (4, 4)).T
-    return share @ model[:3, :3].T + model[:3, 3]
-
-
 # ---------------------------------------------------------------- the data
 
 
 def test_seen_and_hidden_points_have_their_colours(scan):
     shown = scene(scan_view(scan, PART, voxel_mm=2.0))
     seen, hidden = seen_and_hidden(scan, voxel_mm=2.0)
-    code = np.frombuffer(base64.b64decode(shown["scan"]["deviation_um"]), "<i2")
+    code = decoded(shown["scan"]["deviation_um"], "<i2")
     found = placed(shown["scan"]["points"], shown["poses"][1]["model"]) + PART.center
     # half a step of the grid of 65,535 over at most 130 mm
     np.testing.assert_allclose(found[code < 0], seen, atol=0.002)
     np.testing.assert_allclose(found[code > 0], hidden, atol=0.002)
-    table = np.frombuffer(base64.b64decode(shown["colors"]), "u1").reshape(256, 4)
+    table = decoded(shown["colors"], "u1").reshape(256, 4)
     np.testing.assert_allclose(table[[0, -1], :3] / 255, [to_rgb(SCAN), to_rgb(HIDDEN)], atol=2e-3)
 
 
@@ -102,14 +94,6 @@ def test_it_is_written_whole(view, tmp_path):
 
 
 # ---------------------------------------------------------------- in a browser
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[HeadlessBrowser]:
-    if CHROMIUM is None:
-        pytest.skip("no chromium or google-chrome on the PATH")
-    with HeadlessBrowser() as running:
-        yield running
 
 
 def opened(browser: HeadlessBrowser, view: View3d, folder: Path) -> np.ndarray:

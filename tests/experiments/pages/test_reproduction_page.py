@@ -8,7 +8,6 @@ import re
 from pathlib import Path
 
 import pytest
-from headless_browser import CHROMIUM, HeadlessBrowser
 from matplotlib.figure import Figure
 
 from experiments import reproduce
@@ -119,14 +118,6 @@ def test_what_is_folded_is_folded_in_both_writings() -> None:
     assert "```" not in open_text
     assert max(map(len, re.findall(r"(?:^\|.*\n)+", open_text, re.MULTILINE))) < 6000
     assert len(open_text.splitlines()) < 330
-
-
-@pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None:
-        pytest.skip("no chromium or google-chrome on the PATH")
-    with HeadlessBrowser() as one:
-        yield one
 
 
 @pytest.mark.parametrize("width", [1280, 390])
