@@ -21,7 +21,7 @@ from absl import flags
 
 from experiments.runner import command_line
 from experiments.runner import evaluation_pictures as pictures
-from experiments.runner.evaluation_report import hardest_views, plain, summarize, table
+from experiments.runner.evaluation_report import plain, summarize, table
 from experiments.runner.experiment import Experiment
 from experiments.runner.machine import report_head
 from experiments.runner.registrations import Results, register_views
@@ -40,15 +40,14 @@ def evaluate(
     variables: Variables,
     folder: Path,
     *,
-    part: Part | None = None,
+    part: Part,
     training: TrainingRecord | None = None,
 ) -> dict[str, Any]:
     """Registers the test views from the identity; returns what evaluation.json holds.
 
-    With the CAD ``part``, the pictures that need it are drawn too; with the ``training``, the
-    report says how long it took, and its curves are drawn. Raises InputError without test views.
+    With the ``training``, the report says how long it took, and its curves are drawn. Raises
+    InputError without test views.
     """
-    test = scans.test
     results = registered(config, scans, variables)
     report = report_of(config, scans, results)
     if training is not None:
@@ -57,9 +56,7 @@ def evaluate(
     log = training.rows if training is not None else ()
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "evaluation.json", report)
-    pictures.draw(results, test, hardest_views(test), log, folder)
-    if part is not None:
-        pictures.draw_with_part(results, test, hardest_views(test), part, config, folder)
+    pictures.draw(results, scans.test, part, config.make_camera(), log, folder)
     print(table(report))
     return report
 

@@ -13,7 +13,6 @@ VANEJAX_CACHE_DIR is where compiled programs are kept (~/.cache/vanejax); off ke
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,6 +27,7 @@ from experiments.runner import command_line
 from experiments.runner import study_command as study
 from experiments.runner.machine import PACKAGES, PEERS, report_head, versions
 from experiments.runner.registrations import Results, register_views
+from experiments.runner.sweep import with_values
 from experiments.studies.comparison.methods import TITLES, make_method
 from experiments.studies.comparison.settings import CLASSICAL, OPEN3D, Comparison
 from experiments.train import load_or_scan
@@ -72,16 +72,6 @@ def cells(grid: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
     """Every combination of a grid, as values by field."""
     for values in itertools.product(*grid.values()):
         yield dict(zip(grid, values, strict=True))
-
-
-def with_values(config: Comparison, values: Mapping[str, Any]) -> Comparison:
-    """The comparison with these fields, such as ``icp.max_distance``, changed."""
-    config = copy.deepcopy(config)
-    for path, value in values.items():
-        group, name = path.split(".")
-        settings = getattr(config, group)
-        setattr(config, group, dataclasses.replace(settings, **{name: value}))
-    return config
 
 
 def score_deg(results: Results) -> float:

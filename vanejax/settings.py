@@ -17,7 +17,7 @@ import dataclasses
 import difflib
 import math
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 from vanejax.errors import InputError
@@ -93,6 +93,12 @@ def settings_class(cls: _Class) -> _Class:
     return cls
 
 
+def hint(name: str, names: Iterable[str]) -> str:
+    """What to add to a message about an unknown name: the nearest one that there is, if any."""
+    near = difflib.get_close_matches(name, names, 1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
 class Settings:
     """Base of settings; subclasses are decorated with `settings_class`."""
 
@@ -104,10 +110,8 @@ class Settings:
         """
         names = [field.name for field in dataclasses.fields(self)]  # pyright: ignore[reportArgumentType]
         if name not in names:
-            near = difflib.get_close_matches(name, names, 1)
-            hint = f"; did you mean {near[0]}?" if near else ""
             raise InputError(
-                f"{type(self).__name__} has no field {name!r}{hint} (its fields are: "
+                f"{type(self).__name__} has no field {name!r}{hint(name, names)} (its fields are: "
                 f"{', '.join(names)})"
             )
         super().__setattr__(name, value)

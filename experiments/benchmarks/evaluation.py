@@ -24,7 +24,7 @@ from experiments.benchmarks.processes import first_and_later, measured
 from experiments.benchmarks.timing import Bench, Figure
 from experiments.configs.vane import get_config
 from experiments.runner import evaluation_pictures as pictures
-from experiments.runner.evaluation_report import hardest_views, table
+from experiments.runner.evaluation_report import table
 from vanejax import compilation_cache
 from vanejax.training import ScanSet, load_scan_set, make_bank, make_scan_set
 
@@ -81,9 +81,7 @@ def measure(scans: ScanSet) -> dict[str, float]:
         results = evaluate.registered(config, scans, variables, progress=False)
         print(table(evaluate.report_of(config, scans, results)))
         reported = time.perf_counter()
-        hardest = hardest_views(scans)
-        pictures.draw(results, scans, hardest, (), Path(folder))
-        pictures.draw_with_part(results, scans, hardest, part, config, Path(folder))
+        pictures.draw(results, scans, part, config.make_camera(), (), Path(folder))
         drawn = time.perf_counter()
     return {
         "figures": reported - began,

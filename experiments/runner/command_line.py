@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import importlib.util
 import re
@@ -19,6 +18,7 @@ from experiments.runner.experiment import Experiment
 from experiments.runner.stopping import exit_code
 from vanejax import compilation_cache
 from vanejax.errors import InputError
+from vanejax.settings import hint
 
 CONFIG_FOLDER = Path(__file__).parents[1] / "configs"
 flags.disclaim_key_flags()  # the flags defined here belong to the command that asks for them
@@ -157,10 +157,10 @@ def check_field(config: Any, path: str) -> None:
     for name in path.split("."):
         names = [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
         if name not in names:
-            near = difflib.get_close_matches(name, names, 1)
-            hint = f"; did you mean {near[0]}?" if near else ""
             right = f"its fields are: {', '.join(names)}" if names else "it has no fields"
-            raise InputError(f"--config.{path}: {walked} has no {name!r}{hint} ({right})")
+            raise InputError(
+                f"--config.{path}: {walked} has no {name!r}{hint(name, names)} ({right})"
+            )
         node = getattr(node, name)
         walked = f"{walked}.{name}"
     if dataclasses.is_dataclass(node):

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.runner.experiment import Experiment
+from experiments.runner.evaluation_report import hardest_views
 from experiments.runner.registrations import Results
 from vanejax import plotting
 from vanejax.cad import Part
@@ -23,12 +22,17 @@ PORTRAIT_DISTANCE = 6.0  # times the part's radius: the near plane must not cut 
 def draw(
     results: Results,
     scans: ScanSet,
-    hardest: np.ndarray,
+    part: Part,
+    camera: Camera,
     log: Sequence[Mapping[str, float]],
     folder: Path,
 ) -> None:
-    """overlays.png, error_map.png, axis_errors.png and, with a log, training_curves.png."""
-    errors, views = results.errors, scans.viewpoints
+    """Errors, the hardest views and what they see (Fig. 5), and, with a log, its curves."""
+    errors, views, hardest = results.errors, scans.viewpoints, hardest_views(scans)
+    scanner = Scanner(part, surface_samples=SURFACE_SAMPLES)
+    shadows, seen = shadow_picture(scanner, camera, views, hardest)
+    fine = camera.scaled(PORTRAIT_PIXELS)
+    shown = overlay(results, scans, hardest[0])
     figures = {
         "overlays": plotting.registration_overlays(
             [overlay(results, scans, view) for view in hardest]
@@ -44,6 +48,8 @@ def draw(
                 )
             }
         ),
+        "view_and_shadow": shadows,
+        "overview": plotting.overview_picture(portrait(scanner, fine), fine, seen[0], shown),
     }
     if log:
         figures["training_curves"] = plotting.training_curves(log)
@@ -51,31 +57,16 @@ def draw(
         plotting.save_figure(figure, folder / f"{name}.png")
 
 
-def draw_with_part(
-    results: Results,
-    scans: ScanSet,
-    hardest: np.ndarray,
-    part: Part,
-    config: Experiment,
-    folder: Path,
-) -> None:
-    """view_and_shadow.png, Fig. 5 for the hardest views, and overview.png."""
-    scanner = Scanner(part, surface_samples=SURFACE_SAMPLES)
-    camera, views = config.make_camera(), scans.viewpoints
-    figure, seen = shadow_picture(scanner, camera, views, hardest)
-    plotting.save_figure(figure, folder / "view_and_shadow.png")
-
-    fine = camera.scaled(PORTRAIT_PIXELS)
+def portrait(scanner: Scanner, camera: Camera) -> Scan:
+    """The part as the reader of an overview sees it."""
+    part = scanner.part
     eye = hemisphere_viewpoints(
         part.center,
         distance_mm=max(PORTRAIT_DISTANCE * part.radius, camera.near_mm + 1.1 * part.radius),
         elevations_deg=(plotting.READER_ELEVATION_DEG,),
         azimuths_deg=(plotting.READER_AZIMUTH_DEG,),
     )
-    portrait = scanner.scan(fine, eye.view(0))
-    shown = overlay(results, scans, hardest[0])
-    figure = plotting.overview_picture(portrait, fine, seen[0], shown)
-    plotting.save_figure(figure, folder / "overview.png")
+    return scanner.scan(camera, eye.view(0))
 
 
 def shadow_picture(

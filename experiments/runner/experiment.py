@@ -5,14 +5,21 @@ Every field can be overridden on the command line: ``--config.model.num_neighbor
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 from dataclasses import field
 
 from vanejax.cad import Part, guide_vane, load_part
 from vanejax.errors import InputError
 from vanejax.scanner import Camera, Viewpoints, hemisphere_viewpoints
-from vanejax.settings import Settings, bounded, field_paths, not_negative, positive, settings_class
+from vanejax.settings import (
+    Settings,
+    bounded,
+    field_paths,
+    hint,
+    not_negative,
+    positive,
+    settings_class,
+)
 from vanejax.training import (
     OptimizerSettings,
     PairSampling,
@@ -216,10 +223,8 @@ class Experiment(Settings):
         """
         name = self.model.name
         if name not in NETWORKS:
-            near = difflib.get_close_matches(name, NETWORKS, 1)
-            hint = f"; did you mean {near[0]}?" if near else ""
             raise InputError(
-                f"config.model.name={name!r}: there is no such network{hint} "
+                f"config.model.name={name!r}: there is no such network{hint(name, NETWORKS)} "
                 f"(the names are {', '.join(NETWORKS)})"
             )
         return NETWORKS[name]

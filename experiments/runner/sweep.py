@@ -12,13 +12,14 @@ import json
 import math
 import re
 import typing
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from experiments.runner import command_line
 from experiments.runner.experiment import Experiment
 from vanejax.errors import InputError
 
+_Tree = typing.TypeVar("_Tree")
 LONGEST_NAME = 120  # of a cell's folder; file systems take 255 bytes
 
 
@@ -53,12 +54,16 @@ class Cell:
 
     def config(self, base: Experiment) -> Experiment:
         """The base with the cell's overrides and seed; the base stays as it is."""
-        config = copy.deepcopy(base)
-        config.seed = self.seed
-        for field, value in self.overrides:
-            *groups, name = field.split(".")
-            setattr(functools.reduce(getattr, groups, config), name, value)
-        return config
+        return with_values(base, {"seed": self.seed} | dict(self.overrides))
+
+
+def with_values(config: _Tree, values: Mapping[str, Any]) -> _Tree:
+    """A copy with the fields of these paths, such as "model.num_neighbors", set."""
+    config = copy.deepcopy(config)
+    for path, value in values.items():
+        *groups, name = path.split(".")
+        setattr(functools.reduce(getattr, groups, config), name, value)
+    return config
 
 
 def grid(sweeps: Sequence[Sweep], seeds: Sequence[int]) -> list[Cell]:

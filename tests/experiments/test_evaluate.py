@@ -202,4 +202,4 @@ def test_without_test_views_there_is_nothing_to_evaluate(
     config: Experiment, scans: ScanSet, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match="azimuths_deg"):
-        evaluate(config, scans.train, {}, tmp_path)
+        evaluate(config, scans.train, {}, tmp_path, part=config.make_part())
