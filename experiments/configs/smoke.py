@@ -7,7 +7,7 @@ from experiments.runner.experiment import (
     TrainingSettings,
     ViewSettings,
 )
-from vanejax.training.rpmnet_loss import RpmNetLoss
+from vanejax.training import RpmNetLoss
 
 
 def get_config() -> Experiment:

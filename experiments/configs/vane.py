@@ -1,7 +1,7 @@
 """The default recipe: the paper's data and network, with what was measured to train better."""
 
 from experiments.runner.experiment import Experiment, TrainingSettings
-from vanejax.training.rpmnet_loss import RpmNetLoss
+from vanejax.training import RpmNetLoss
 
 
 def get_config() -> Experiment:

@@ -1,8 +1,8 @@
 """The default recipe on scans without end: any view, another structured-light camera each time."""
 
 from experiments.runner.experiment import DataSettings, Experiment, TrainingSettings
+from vanejax.training import RpmNetLoss
 from vanejax.training.online_scans import OnlineScans
-from vanejax.training.rpmnet_loss import RpmNetLoss
 
 
 def get_config() -> Experiment:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
+
+from experiments.pages.reproduction.studies import recorded
 
 
 @pytest.fixture(scope="session")
@@ -31,3 +36,21 @@ def hasty_compiler(programs: Path) -> Iterator[None]:
     for name, value in before.items():
         jax.config.update(name, value)
     compilation_cache.reset_cache()
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Callable[..., dict[str, Any]]:
+    """Runs a study with arguments of its command: its report, which is what NAME.json holds."""
+
+    def run(study: ModuleType, name: str, *arguments: str) -> dict[str, Any]:
+        report = study.main(study.make_parser().parse_args([*arguments, "--out", str(tmp_path)]))
+        assert json.loads((tmp_path / f"{name}.json").read_text()) == report
+        return report
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def results() -> dict[str, Any]:
+    """The recorded results by name; not to be changed."""
+    return recorded()

@@ -20,8 +20,7 @@ from experiments.studies.comparison.settings import METHODS, Comparison
 from experiments.studies.comparison.table import HEAD, beside_open3d, table
 from vanejax.errors import InputError, MissingExtra
 from vanejax.matching.baselines.icp import icp
-from vanejax.training.dataset import load_scan_set
-from vanejax.training.pairs import make_bank
+from vanejax.training import load_scan_set, make_bank
 
 pytestmark = pytest.mark.usefixtures("hasty_compiler")
 
@@ -181,9 +180,7 @@ def test_the_classical_methods_stand_beside_open3ds(report: dict) -> None:
     assert "goal 1.1: met" in beside_open3d({"methods": [icp, slower]})[1]
 
 
-def test_success_needs_both_errors_and_what_is_not_finite_is_none(
-    report: dict, folder: Path
-) -> None:
+def test_success_needs_both_errors_and_what_is_not_finite_is_none(report, folder) -> None:
     """Counted anew from the pose errors of each view, with errors that are made to differ."""
     experiment, scans = small().experiment, load_scan_set(folder / "scans.npz")
     results = register_views(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from pathlib import Path
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +18,8 @@ from experiments.runner.experiment import Experiment
 from experiments.runner.registrations import Results, register_views
 from experiments.runner.run_folder import TrainingRecord
 from vanejax.errors import InputError
-from vanejax.matching import Registration
+from vanejax.matching import Register, Registration
 from vanejax.matching.se3 import rotation_angle
-from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.training import ScanSet, make_scan_set
 from vanejax.training.pairs import ScanBank, draw_source, make_bank
@@ -53,9 +52,16 @@ def bank(config: Experiment, scans: ScanSet) -> ScanBank:
     return make_bank(scans.test, num_reference=config.data.num_reference)
 
 
-def stay(
-    source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
-) -> Registration:
+@pytest.fixture(scope="module")
+def register(config: Experiment, scans: ScanSet, bank: ScanBank) -> Callable[[Register], Results]:
+    """Registers the test views with a method."""
+    sampling, radius_mm = config.pair_sampling(scans), scans.radius_mm
+    return lambda method: register_views(
+        method, bank, sampling, seed=config.seed, unit_mm=radius_mm, progress=False
+    )
+
+
+def stay(source, target, init, key) -> Registration:
     """The method that does nothing."""
     return Registration(
         target_from_source=jax.tree.map(jnp.asarray, init),
@@ -66,9 +72,7 @@ def stay(
     )
 
 
-def lose_some(
-    source: PointCloud, target: PointCloud, init: RigidTransform, key: jax.Array
-) -> Registration:
+def lose_some(source, target, init, key) -> Registration:
     """Fails where the source's first point has a positive x."""
     found = stay(source, target, init, key)
     lost = jnp.where(source.xyz[0, 0] > 0, jnp.nan, 0.0)
@@ -76,25 +80,12 @@ def lose_some(
     return found.replace(target_from_source=pose.replace(translation=pose.translation + lost))
 
 
-def register(method, config: Experiment, scans: ScanSet, bank: ScanBank) -> Results:
-    return register_views(
-        method,
-        bank,
-        config.pair_sampling(scans),
-        seed=config.seed,
-        unit_mm=scans.radius_mm,
-        progress=False,
-    )
-
-
 def report_of(results: Results, scans: ScanSet) -> dict:
     return plain(summarize(results, scans.test) | {"method": "a test", "part": {"name": "vane"}})
 
 
-def test_doing_nothing_is_as_wrong_as_the_pose_drawn(
-    config: Experiment, scans: ScanSet, bank: ScanBank
-) -> None:
-    results = register(stay, config, scans, bank)
+def test_doing_nothing_is_as_wrong_as_the_pose_drawn(register, scans: ScanSet) -> None:
+    results = register(stay)
     truth = results.pairs.target_from_source
     assert truth.rotation.shape == (6, 3, 3)
     angle = np.degrees(rotation_angle(jnp.asarray(truth.rotation)))
@@ -106,10 +97,8 @@ def test_doing_nothing_is_as_wrong_as_the_pose_drawn(
     assert (results.fit_at_truth.rmse_mm < results.fit.rmse_mm).all()
 
 
-def test_every_method_gets_the_same_pairs_each_view_its_own(
-    config: Experiment, scans: ScanSet, bank: ScanBank
-) -> None:
-    one, other = (register(method, config, scans, bank).pairs for method in (stay, lose_some))
+def test_every_method_gets_the_same_pairs_each_view_its_own(register) -> None:
+    one, other = (register(method).pairs for method in (stay, lose_some))
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_array_equal(a, b)
     poses = one.target_from_source.translation
@@ -124,10 +113,8 @@ def test_the_hardest_views_see_least_at_their_elevation(scans: ScanSet) -> None:
     np.testing.assert_array_equal(hardest_views(test), [1, 5])
 
 
-def test_what_is_not_finite_is_counted_and_left_out(
-    config: Experiment, scans: ScanSet, bank: ScanBank
-) -> None:
-    results = register(lose_some, config, scans, bank)
+def test_what_is_not_finite_is_counted_and_left_out(register, scans: ScanSet) -> None:
+    results = register(lose_some)
     report = report_of(results, scans)
     lost = results.pairs.source.xyz[:, 0, 0] > 0
     assert 0 < lost.sum() < 6  # or this test says nothing
@@ -143,21 +130,17 @@ def test_what_is_not_finite_is_counted_and_left_out(
     json.dumps(report, allow_nan=False)
 
 
-def test_a_method_that_always_fails_has_no_figures(
-    config: Experiment, scans: ScanSet, bank: ScanBank
-) -> None:
+def test_a_method_that_always_fails_has_no_figures(register, scans: ScanSet) -> None:
     def fail(*arguments) -> Registration:
         return jax.tree.map(lambda leaf: leaf * jnp.nan, stay(*arguments))
 
-    report = report_of(register(fail, config, scans, bank), scans)
+    report = report_of(register(fail), scans)
     assert report["summary"]["rotation_error_deg"]["mean"] is None
     assert report["mre_per_axis_deg"] == [None] * 3
     assert "WARNING: 6 of 6 views" in table(report)
 
 
-def test_evaluate_writes_json_and_pictures(
-    config: Experiment, scans: ScanSet, bank: ScanBank, tmp_path: Path, capsys
-) -> None:
+def test_evaluate_writes_json_and_pictures(config, scans, bank, register, tmp_path, capsys) -> None:
     model, sampling = config.make_network().model, config.pair_sampling(scans)
     key = jax.random.key(0)
     source, _ = draw_source(key, bank, jnp.asarray(0), sampling)
@@ -166,14 +149,8 @@ def test_evaluate_writes_json_and_pictures(
     )
     rows = [{"step": step, "loss": 1 / step, "rotation_error_deg": 2.0} for step in (1, 2, 3)]
     part = config.make_part()
-    report = evaluate(
-        config,
-        scans,
-        variables,
-        tmp_path,
-        part=part,
-        training=TrainingRecord(rows, 36.0),
-    )
+    training = TrainingRecord(rows, 36.0)
+    report = evaluate(config, scans, variables, tmp_path, part=part, training=training)
 
     def refuse(constant: str) -> float:
         raise ValueError(constant)
@@ -193,13 +170,11 @@ def test_evaluate_writes_json_and_pictures(
     printed = capsys.readouterr().out
     assert "rotation error (deg)" in printed
     # the same weights and seed give the same figures
-    found = register(config.make_network().register(variables), config, scans, bank)
+    found = register(config.make_network().register(variables))
     again = [row["rotation_error_deg"] for row in report["rows"]]
     np.testing.assert_array_equal(found.errors.rotation_deg, np.float32(again))
 
 
-def test_without_test_views_there_is_nothing_to_evaluate(
-    config: Experiment, scans: ScanSet, tmp_path: Path
-) -> None:
+def test_without_test_views_there_is_nothing_to_evaluate(config, scans, tmp_path) -> None:
     with pytest.raises(InputError, match="azimuths_deg"):
         evaluate(config, scans.train, {}, tmp_path, part=config.make_part())

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from experiments import benchmark
-from experiments.benchmark import main, make_parser
 from experiments.benchmarks import (
     compilation,
     evaluation,
@@ -99,9 +98,7 @@ def test_the_largest_view_is_taken(bench: Bench) -> None:
         (network.torch_inference, (VanePairs(),)),
     ],
 )
-def test_a_peer_that_is_not_installed_is_skipped(
-    time, more: tuple, bench: Bench, monkeypatch
-) -> None:
+def test_a_peer_that_is_not_installed_is_skipped(time, more, bench, monkeypatch) -> None:
     for name in machine.PEERS:
         monkeypatch.setitem(sys.modules, name, None)
     figure = time(bench, *more)
@@ -310,11 +307,9 @@ def test_every_cost_has_its_series(once: Bench, monkeypatch) -> None:
 
 
 @pytest.mark.slow
-def test_the_refinements_are_compared(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_the_refinements_are_compared(record, monkeypatch, capsys) -> None:
     monkeypatch.setattr(benchmark, "Bench", functools.partial(Bench, views=SMALL))
-    arguments = ["--only", "refine", "--repeats", "1", "--out", str(tmp_path)]
-    report = main(make_parser().parse_args(arguments))
-    assert json.loads((tmp_path / "benchmark.json").read_text()) == report
+    report = record(benchmark, "benchmark", "--only", "refine", "--repeats", "1")
     rows = {row["name"]: row for row in report["rows"]}
     against = {entry["name"]: entry for entry in rows["refine"]["against"]}
     assert against["bare casts of refine"]["ratio"] > 1
@@ -328,20 +323,18 @@ def test_the_refinements_are_compared(tmp_path: Path, monkeypatch, capsys) -> No
     assert "GFLOP/s" in printed
 
 
-def test_scaling_has_a_table_of_its_own(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_scaling_has_a_table_of_its_own(record, monkeypatch, capsys) -> None:
     def quadratic(bench: Bench) -> Iterator[Series]:
         assert bench.large
         yield Series("a thing", "points", [10, 20], [[0.1], [0.4]])
 
     monkeypatch.setitem(benchmark.BENCHMARKS, "scaling", quadratic)
-    arguments = ["--only", "scaling", "--large", "--out", str(tmp_path)]
-    report = main(make_parser().parse_args(arguments))
+    report = record(benchmark, "benchmark", "--only", "scaling", "--large")
     assert report["rows"] == []
     assert report["scaling"][0]["exponent"] == pytest.approx(2.0)
     assert "a thing: grows as size^2.00" in capsys.readouterr().out
 
 
-def test_an_unknown_benchmark_is_refused(tmp_path: Path) -> None:
-    arguments = make_parser().parse_args(["--only", "refine,speed", "--out", str(tmp_path)])
+def test_an_unknown_benchmark_is_refused(record) -> None:
     with pytest.raises(InputError, match="no benchmark speed; there are scan, step, inference"):
-        main(arguments)
+        record(benchmark, "benchmark", "--only", "refine,speed")

@@ -72,9 +72,7 @@ def test_it_finds_what_vanejax_finds(peer: TorchRpmNet, variables: dict, clouds)
 
 
 @pytest.mark.slow
-def test_a_step_has_the_loss_and_gradient_of_vanejax(
-    peer: TorchRpmNet, variables: dict, clouds
-) -> None:
+def test_a_step_has_the_loss_and_gradient_of_vanejax(peer, variables, clouds) -> None:
     source, target = clouds
     truth = RigidTransform(exp_so3(np.float32([0.0, 0.1, 0.0])), np.float32([0.0, 0.0, 0.1]))
     matrix = np.asarray(truth.as_matrix())[:3]

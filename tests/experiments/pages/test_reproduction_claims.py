@@ -10,14 +10,9 @@ from example_position import stand_record
 
 from experiments.pages.reproduction.claim import Claim, Verdict, digits
 from experiments.pages.reproduction.document import TOPICS, document, to_markdown
-from experiments.pages.reproduction.studies import BY_RECORD, recorded
+from experiments.pages.reproduction.studies import BY_RECORD
 
 CLAIMS = [claim for topic in TOPICS.values() for claim in topic.claims]
-
-
-@pytest.fixture(scope="module")
-def results() -> dict[str, Any]:
-    return recorded()
 
 
 def claim(words: str) -> Claim:

@@ -8,28 +8,16 @@ from typing import Any
 
 import pytest
 
-from experiments.pages.reproduction.studies import (
-    BY_RECORD,
-    RESULTS,
-    STUDIES,
-    Study,
-    chosen,
-    recorded,
-)
+from experiments.pages.reproduction import studies
 from vanejax.errors import InputError
 
 
-@pytest.fixture(scope="module")
-def results() -> dict[str, Any]:
-    return recorded()
-
-
 def test_every_record_has_a_study_and_every_study_a_record() -> None:
-    there = {path.stem for path in RESULTS.glob("*.json")}
-    assert there <= set(BY_RECORD)
+    there = {path.stem for path in studies.RESULTS.glob("*.json")}
+    assert there <= set(studies.BY_RECORD)
 
 
-def arguments_of(study: Study) -> dict[str, Any]:
+def arguments_of(study: studies.Study) -> dict[str, Any]:
     """What the command's own parser makes of a study's arguments."""
     parser = importlib.import_module(study.arguments[0]).make_parser()
     words = study.words({"out": "o", "real_scans": "r", "shapes": "solids"})[1:]
@@ -37,7 +25,9 @@ def arguments_of(study: Study) -> dict[str, Any]:
     return json.loads(json.dumps(values, default=str))
 
 
-@pytest.mark.parametrize("study", [s for s in STUDIES if s.record], ids=lambda study: study.name)
+@pytest.mark.parametrize(
+    "study", [s for s in studies.STUDIES if s.record], ids=lambda study: study.name
+)
 def test_the_command_is_the_one_that_made_the_record(study, results) -> None:
     if study.record not in results:
         pytest.skip(f"{study.record} is not recorded yet")
@@ -65,11 +55,11 @@ def test_the_command_is_the_one_that_made_the_record(study, results) -> None:
 
 
 def test_studies_come_after_what_they_need() -> None:
-    for place, study in enumerate(STUDIES):
-        before = {other.name for other in STUDIES[:place]}
+    for place, study in enumerate(studies.STUDIES):
+        before = {other.name for other in studies.STUDIES[:place]}
         assert set(study.needs) <= before
         used = {a.split("}/")[1].split("/")[0] for a in study.arguments if "{out}/" in a}
         assert used <= set(study.needs) | {study.name}
-    assert [s.name for s in chosen("any_pose")] == ["vane", "vane_weights", "any_pose"]
+    assert [s.name for s in studies.chosen("any_pose")] == ["vane", "vane_weights", "any_pose"]
     with pytest.raises(InputError, match="no study nothing; there are vane"):
-        chosen("nothing")
+        studies.chosen("nothing")

@@ -106,9 +106,7 @@ def test_an_unknown_config_lists_those_there_are() -> None:
         (["--config", "table1.py"], ["of the kind Comparison", "takes Experiment"]),
     ],
 )
-def test_a_wrong_command_line_is_one_clear_error(
-    arguments: list[str], words: list[str], command, capsys
-) -> None:
+def test_a_wrong_command_line_is_one_clear_error(arguments, words, command, capsys) -> None:
     assert command(*arguments) == 2
     text = capsys.readouterr().err
     assert text.startswith("error: ")

@@ -43,9 +43,7 @@ def test_faults_of_the_input_are_one_line(monkeypatch: pytest.MonkeyPatch, capsy
     assert run(monkeypatch, lambda settings: {"a": "report"}) == 0
 
 
-def test_compiled_programs_are_kept_where_the_user_says(
-    monkeypatch: pytest.MonkeyPatch, capsys
-) -> None:
+def test_compiled_programs_are_kept_where_the_user_says(monkeypatch, capsys) -> None:
     enabled = []
     monkeypatch.setattr(study.compilation_cache, "enable", lambda: enabled.append(True))
     assert run(monkeypatch, lambda settings: enabled.append(False)) == 0

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from experiments.runner.vane_views import VaneViews
 from experiments.studies.any_pose import study as any_pose
-from experiments.studies.any_pose.study import main, summarize, table, turned_scan
+from experiments.studies.any_pose.study import summarize, table, turned_scan
 from vanejax.errors import InputError
 from vanejax.localization.pose_batch import stack
-from vanejax.scanner.camera import Camera
+from vanejax.scanner import Camera
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +56,9 @@ def test_what_is_wrong_is_counted_and_listed() -> None:
     assert table(few).splitlines()[-1].startswith("MISSED")
 
 
-def test_the_command_writes_what_it_found(views: VaneViews, tmp_path: Path, monkeypatch) -> None:
+def test_the_command_writes_what_it_found(views: VaneViews, record, monkeypatch) -> None:
     monkeypatch.setattr(any_pose, "VaneViews", lambda: views)
-    parser = any_pose.make_parser()
-    report = main(parser.parse_args(["--count", "1", "--out", str(tmp_path)]))
-    assert json.loads((tmp_path / "any_pose.json").read_text()) == report
+    report = record(any_pose, "any_pose", "--count", "1")
     (row,) = report["rows"]
     assert row["right"]
     assert row["verdict"] == "accepted"
@@ -72,4 +67,4 @@ def test_the_command_writes_what_it_found(views: VaneViews, tmp_path: Path, monk
     assert set(row["stages"]) >= {"search", "refine", "verify"}
     assert report["method"].endswith("no training")
     with pytest.raises(InputError, match=r"no_such\.npz"):
-        main(parser.parse_args(["--weights", "no_such.npz", "--out", str(tmp_path)]))
+        record(any_pose, "any_pose", "--weights", "no_such.npz")

@@ -9,12 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from experiments.studies.verdicts.challenge_parts import challenge_parts, names_of_parts
-from vanejax.cad.symmetry import (
-    DenseSurface,
-    cyclic,
-    dihedral,
-    rotation_about,
-)
+from vanejax.cad.symmetry import DenseSurface, cyclic, rotation_about
 from vanejax.rigid import RigidTransform
 
 # samples as discs of a 0.4 mm wide neighbourhood on facets of 4 deg: their sag, and no more
@@ -92,10 +87,8 @@ def test_a_turned_part_is_kept_by_every_turn(parts):
         for angle in (1.1, 77.7, 200.0):
             # sag of the facets: 40 (1 - cos(180 deg / 96)) = 0.02
             assert surface.mismatch_mm(rotation_about(direction, angle, point)) < 0.03, name
-    assert [n for n, p in parts.items() if p.continuous_axis is not None] == [
-        "shaft",
-        "sphere_flat",
-    ]
+    turned = [name for name, part in parts.items() if part.continuous_axis is not None]
+    assert turned == ["shaft", "sphere_flat"]
 
 
 @pytest.mark.parametrize(
@@ -124,14 +117,6 @@ def test_the_flange_with_one_wider_hole_is_near_every_turn_by_a_hole(parts):
     turns = transforms(cyclic(6, np.array([0.0, 0, 1]), challenge.part.center)[1:])
     for turn in turns:
         assert min(challenge.pose_error(turn, n)[0] for n in near) < 1
-
-
-def test_groups_have_their_orders():
-    z, x, point = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([3.0, -4, 5])
-    assert len(cyclic(5, z, point)) == 5
-    group = dihedral(3, z, x, point)
-    assert len(np.unique(np.round(group, 9), axis=0)) == 6
-    np.testing.assert_allclose(group[:, :3, :3] @ point + group[:, :3, 3], np.tile(point, (6, 1)))
 
 
 @pytest.fixture(scope="module")

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,24 +10,11 @@ from scipy.spatial import cKDTree
 from experiments.runner.vane_views import VaneViews
 from experiments.studies.density import study as density
 from experiments.studies.density.report import verdict
-from experiments.studies.density.study import (
-    ERRORS,
-    METRICS,
-    Sweep,
-    cancellation,
-    first_of_rest,
-    fit,
-    jittered,
-    main,
-    measure,
-    share_distinguished,
-    summarize,
-)
 from vanejax.errors import InputError
-from vanejax.matching.metrics import surface_fit
+from vanejax.matching import surface_fit
 from vanejax.pointcloud import PointCloud
-from vanejax.scanner.camera import Camera
-from vanejax.training.pairs import PairSampling
+from vanejax.scanner import Camera
+from vanejax.training import PairSampling
 
 VIEW = 52
 COUNTS = (256, 1024, 4096)
@@ -42,30 +26,32 @@ def views() -> VaneViews:
 
 
 @pytest.fixture(scope="module")
-def sweep(views: VaneViews) -> Sweep:
+def sweep(views: VaneViews) -> density.Sweep:
     return sweep_of(views)
 
 
-def sweep_of(views: VaneViews, **changes: object) -> Sweep:
+def sweep_of(views: VaneViews, **changes: object) -> density.Sweep:
     given = {
         "varied": "CAD", "sizes": COUNTS, "cad_noise": 0.0, "scan_noise": 0.0, "draws": 4, "seed": 0
     } | changes  # fmt: skip
-    return measure(views, [VIEW], **given)
+    return density.measure(views, [VIEW], **given)
 
 
-def made_up(scores: np.ndarray, *, signed: np.ndarray | None = None, **changes: object) -> Sweep:
+def made_up(
+    scores: np.ndarray, *, signed: np.ndarray | None = None, **changes: object
+) -> density.Sweep:
     """A sweep whose metrics are all ``scores`` [S, E, D]."""
-    values = dict.fromkeys(METRICS, scores)
+    values = dict.fromkeys(density.METRICS, scores)
     values["ffmde_signed_mm"] = scores if signed is None else signed
     counts = [4**k for k in range(4, 4 + len(scores))]
     given = {"varied": "CAD", "cad_noise": 0.0, "scan_noise": 0.0} | changes
-    return Sweep(cad_points=counts, scan_points=counts, values=values, **given)
+    return density.Sweep(cad_points=counts, scan_points=counts, values=values, **given)
 
 
 def test_the_tree_finds_what_the_metrics_own_search_finds(views: VaneViews) -> None:
     points, normals, _ = views.part.sample(300, 0)
     scan = views.truth(VIEW).apply(views.points(VIEW))[::7] + np.array([[0.4, -0.3, 0.2]])
-    found = fit(scan, cKDTree(points), normals.astype(np.float32))
+    found = density.fit(scan, cKDTree(points), normals.astype(np.float32))
     clouds = (
         PointCloud(
             xyz=jnp.asarray(xyz, jnp.float32), normals=jnp.asarray(normal, jnp.float32),
@@ -74,7 +60,7 @@ def test_the_tree_finds_what_the_metrics_own_search_finds(views: VaneViews) -> N
         for xyz, normal in ((scan, np.zeros_like(scan)), (points, normals))
     )  # fmt: skip
     expected = surface_fit(*clouds, unit_mm=1.0)
-    for name in METRICS:
+    for name in density.METRICS:
         # f32 of squared distances up to 300 mm^2
         np.testing.assert_allclose(found[name], getattr(expected, name), rtol=1e-4)
 
@@ -85,7 +71,7 @@ def test_rmse_on_a_plane_is_the_poisson_neighbours() -> None:
     for count in (400, 6400):
         cad = np.pad(rng.uniform(0, 1, (count, 2)), ((0, 0), (0, 1)))
         scan = np.pad(rng.uniform(0.1, 0.9, (20_000, 2)), ((0, 0), (0, 1)))
-        found = fit(scan, cKDTree(cad), np.tile(np.float32([0, 0, 1]), (count, 1)))
+        found = density.fit(scan, cKDTree(cad), np.tile(np.float32([0, 0, 1]), (count, 1)))
         # some 250 cells inside, each as unsure as its mean: 1 / (2 sqrt 250)
         assert found["rmse_mm"] == pytest.approx(1 / np.sqrt(np.pi * count), rel=0.1)
         assert found["ffmde_abs_mm"] == 0
@@ -93,30 +79,30 @@ def test_rmse_on_a_plane_is_the_poisson_neighbours() -> None:
 
 def test_noise_is_the_papers() -> None:
     zeros, clip = np.zeros((100_000, 3)), PairSampling().noise_clip
-    noisy = jittered(zeros, 0.01, 70.0, np.random.default_rng(0))
+    noisy = density.jittered(zeros, 0.01, 70.0, np.random.default_rng(0))
     assert np.std(noisy) == pytest.approx(0.7, rel=0.01)  # 5 of its own standard deviations
-    assert np.abs(jittered(zeros, 0.1, 70.0, np.random.default_rng(0))).max() == 70 * clip
-    np.testing.assert_array_equal(jittered(zeros, 0.0, 70.0, np.random.default_rng(0)), zeros)
+    assert np.abs(density.jittered(zeros, 0.1, 70.0, np.random.default_rng(0))).max() == 70 * clip
+    np.testing.assert_array_equal(
+        density.jittered(zeros, 0.0, 70.0, np.random.default_rng(0)), zeros
+    )
 
 
-def test_at_the_true_pose_rmse_falls_with_the_root_of_the_density(sweep: Sweep) -> None:
-    report = summarize(sweep, 1.0)
+def test_at_the_true_pose_rmse_falls_with_the_root_of_the_density(sweep: density.Sweep) -> None:
+    report = density.summarize(sweep, 1.0)
     # 4 draws of one view; edges of the part make it a little flatter than on a plane
     assert report["rmse_mm"]["slope"][0] == pytest.approx(-0.5, abs=0.08)
     assert report["ffmde_abs_mm"]["slope"][0] < -0.8
     # a wrong pose stops both, FFMDE sooner
-    last = len(ERRORS) - 1
+    last = len(density.ERRORS) - 1
     assert report["rmse_mm"]["slope"][0] < report["rmse_mm"]["slope"][last] < -0.1
     assert report["ffmde_abs_mm"]["slope"][last] > report["rmse_mm"]["slope"][last]
 
 
-def test_a_sweep_repeats_and_its_poses_do_not_depend_on_size(
-    views: VaneViews, sweep: Sweep
-) -> None:
+def test_a_sweep_repeats_and_its_poses_do_not_depend_on_size(views, sweep) -> None:
     again = sweep_of(views)
     one = sweep_of(views, sizes=COUNTS[1:2])
     other = sweep_of(views, seed=1)
-    for name in METRICS:
+    for name in density.METRICS:
         np.testing.assert_array_equal(again.values[name], sweep.values[name])
         np.testing.assert_array_equal(one.values[name][0], sweep.values[name][1])
         assert not np.any(other.values[name] == sweep.values[name])
@@ -145,35 +131,37 @@ def test_the_scans_own_number_changes_no_mean(views: VaneViews) -> None:
     assert found.cad_points == [density.FIXED_CAD] * 3
     assert found.scan_points == [200, 1600, len(views.points(VIEW))]
     assert found.sizes == found.scan_points
-    for name in METRICS[:2]:
+    for name in density.METRICS[:2]:
         mean = found.values[name].mean(axis=2)
         # 4 x 200 points whose distances differ by about as much as they are large
         np.testing.assert_allclose(mean[0, 1:], mean[-1, 1:], rtol=0.1)
 
 
 def test_slope_is_the_exponent() -> None:
-    falling = np.ones((3, len(ERRORS), 2)) * np.array([1, 0.5, 0.25])[:, None, None]  # sizes 4^k
+    falling = (
+        np.ones((3, len(density.ERRORS), 2)) * np.array([1, 0.5, 0.25])[:, None, None]
+    )  # sizes 4^k
     for scores, exponent in ((falling, -0.5), (np.zeros_like(falling), 0.0)):
-        found = summarize(made_up(scores), 1.0)["rmse_mm"]["slope"]
+        found = density.summarize(made_up(scores), 1.0)["rmse_mm"]["slope"]
         np.testing.assert_allclose(found, exponent, atol=1e-9)
 
 
 def test_the_share_counts_draws_beyond_three_standard_deviations() -> None:
     score = np.array([[[1.0, 3.0], [6.2, 6.3], [6.2, 6.3], [0.0, 99.0]]])  # 2 + 3 sqrt 2 = 6.24
-    np.testing.assert_array_equal(share_distinguished(score), [[0, 0.5, 0.5, 0.5]])
+    np.testing.assert_array_equal(density.share_distinguished(score), [[0, 0.5, 0.5, 0.5]])
 
 
 def test_the_first_of_the_rest_stays_good() -> None:
     sizes = (10, 20, 30, 40)
     for good, expected in (("1111", 10), ("1011", 30), ("0001", 40), ("1110", None)):
-        assert first_of_rest(sizes, np.array([c == "1" for c in good])) == expected
+        assert density.first_of_rest(sizes, np.array([c == "1" for c in good])) == expected
 
 
 def test_signs_that_cancel_are_seen() -> None:
-    size = np.ones((2, len(ERRORS), 2))
+    size = np.ones((2, len(density.ERRORS), 2))
     signed = 0.5 * size
     signed[1, 2] = [-0.04, 0.3]
-    rows = cancellation(made_up(size, signed=signed))
+    rows = density.cancellation(made_up(size, signed=signed))
     assert [row["share"] for row in rows] == [0, 0, 0.25, 0, 0]
     assert (rows[2]["worst_signed_mm"], rows[2]["worst_abs_mm"]) == (0.04, 1)
 
@@ -182,12 +170,12 @@ def test_the_verdict_follows_the_numbers() -> None:
     """FFMDE that keeps its value is praised, and one that behaves as RMSE is not."""
     rng = np.random.default_rng(0)
     sizes = np.array([1, 2, 4])[:, None, None]
-    off = np.arange(len(ERRORS))[None, :, None]
-    jitter = rng.uniform(0.99, 1.01, (3, len(ERRORS), 6))
+    off = np.arange(len(density.ERRORS))[None, :, None]
+    jitter = rng.uniform(0.99, 1.01, (3, len(density.ERRORS), 6))
     dense, free = jitter * (1 + 0.1 * off) / sizes, jitter * (0.1 + off)
     good = made_up(dense)
     good.values["ffmde_abs_mm"] = free
-    praised, refuted = (verdict([summarize(one, 1.0)]) for one in (good, made_up(dense)))
+    praised, refuted = (verdict([density.summarize(one, 1.0)]) for one in (good, made_up(dense)))
     assert "FFMDE ranks poses better than RMSE over unequal densities in every case" in praised
     assert "free of density in every case" in praised
     assert "FFMDE ranks poses better than RMSE over unequal densities in no case" in refuted
@@ -195,19 +183,15 @@ def test_the_verdict_follows_the_numbers() -> None:
     assert "settles at some density in no case" in refuted
     for found, says in ((good, "it does not matter"), (made_up(dense), "it matters too")):
         found.values["rmse_mm"] = found.values["ffmde_abs_mm"]
-        scan = Sweep("scan", 0.0, 0.0, [1] * 3, [1, 2, 4], found.values)
-        assert says in verdict([summarize(good, 1.0), summarize(scan, 1.0)])
+        scan = density.Sweep("scan", 0.0, 0.0, [1] * 3, [1, 2, 4], found.values)
+        assert says in verdict([density.summarize(good, 1.0), density.summarize(scan, 1.0)])
 
 
-def test_the_command_writes_what_it_prints(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, views: VaneViews
-) -> None:
+def test_the_command_writes_what_it_prints(record, tmp_path, monkeypatch, capsys, views) -> None:
     monkeypatch.setattr(density, "VaneViews", lambda: views)
     monkeypatch.setattr(density, "CAD_POINTS", COUNTS)
     monkeypatch.setattr(density, "SCAN_POINTS", (200, 800))
-    arguments = ["--views", "0,52", "--draws", "1", "--out", str(tmp_path)]
-    report = main(density.make_parser().parse_args(arguments))
-    assert json.loads((tmp_path / "density.json").read_text()) == report
+    report = record(density, "density", "--views", "0,52", "--draws", "1")
     assert (tmp_path / "density.png").stat().st_size > 10_000
     assert report["part"]["sha256"] == views.part.sha256
     assert [(s["varied"], s["cad_noise"], s["scan_noise"]) for s in report["sweeps"]] == [
@@ -216,6 +200,5 @@ def test_the_command_writes_what_it_prints(
     assert {s["draws"] for s in report["sweeps"]} == {2}
     printed = " ".join(capsys.readouterr().out.split())
     assert report["verdict"] in printed
-    alone = ["--views", "0", "--draws", "1", "--out", str(tmp_path)]
     with pytest.raises(InputError, match="two draws"):
-        main(density.make_parser().parse_args(alone))
+        record(density, "density", "--views", "0", "--draws", "1")

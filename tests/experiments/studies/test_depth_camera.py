@@ -9,7 +9,7 @@ from experiments.studies.verdicts import depth_camera
 from experiments.studies.verdicts.challenge_parts import challenge_parts
 from experiments.studies.verdicts.depth_camera import KINDS, measure, random_pose, sensor
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.scanner import Scanner
 from vanejax.scans.robust_statistics import robust_sigma
 
 

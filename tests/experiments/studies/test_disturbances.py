@@ -9,13 +9,11 @@ import pytest
 
 from experiments.studies.robustness import disturbances
 from experiments.studies.robustness.disturbances import Disturbed, Series, Stand, saturating
-from vanejax.cad.parametric_vane import guide_vane
+from vanejax.cad import guide_vane
+from vanejax.localization import RayCasting, measurement_model
 from vanejax.localization.pose_batch import stack
-from vanejax.localization.residuals import RayCasting, measurement_model
-from vanejax.scanner.camera import hemisphere_viewpoints
-from vanejax.scanner.measurement import Reason, measure
-from vanejax.scanner.sensor import preset
-from vanejax.scans.segmentation import Segment, Segments
+from vanejax.scanner import Reason, hemisphere_viewpoints, measure, preset
+from vanejax.scans import Segment, Segments
 
 
 @pytest.fixture(scope="module")

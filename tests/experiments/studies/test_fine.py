@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -13,7 +10,7 @@ from experiments.studies.fine import study as fine
 from vanejax.errors import InputError
 from vanejax.localization.pose_batch import stack
 from vanejax.localization.residuals import moved
-from vanejax.scanner.camera import Camera
+from vanejax.scanner import Camera
 
 VIEW = 40
 
@@ -121,11 +118,9 @@ def test_a_covariance_that_is_too_small_and_one_bad_view_are_seen() -> None:
     assert fine.table([bad]).splitlines()[-1].startswith("MISSED")
 
 
-def test_the_study_reaches_the_bound(tmp_path: Path, monkeypatch, capsys, views: VaneViews) -> None:
+def test_the_study_reaches_the_bound(record, tmp_path, monkeypatch, capsys, views) -> None:
     monkeypatch.setattr(fine, "VaneViews", lambda: views)
-    arguments = ["--noise-mm", "0.1,0.5", "--views", "0,120", "--out", str(tmp_path)]
-    report = fine.main(fine.make_parser().parse_args(arguments))
-    assert json.loads((tmp_path / "fine.json").read_text()) == report
+    report = record(fine, "fine", "--noise-mm", "0.1,0.5", "--views", "0,120")
     assert (tmp_path / "fine.png").stat().st_size > 10_000
     assert [level["noise_mm"] for level in report["levels"]] == [0.1, 0.5]
     for level in report["levels"]:

@@ -12,12 +12,10 @@ import trimesh
 from experiments.configs import smoke
 from experiments.runner.registrations import Results, register_views
 from experiments.studies.comparison.fine_step import FineStep
-from vanejax.cad.parametric_vane import guide_vane
-from vanejax.cad.part import Part, load_part
-from vanejax.matching.contract import Registration
+from vanejax.cad import Part, guide_vane, load_part
+from vanejax.matching import Registration
 from vanejax.rigid import RigidTransform
-from vanejax.training.dataset import ScanSet, make_scan_set
-from vanejax.training.pairs import PairSampling, make_bank
+from vanejax.training import PairSampling, ScanSet, make_bank, make_scan_set
 
 AWAY_MM = (60.0, -35.0, 20.0)  # a CAD file whose origin is not the part's centre
 

@@ -84,16 +84,6 @@ def test_without_shapes_there_is_nothing_to_compare(tmp_path: Path) -> None:
         public_vs_virtual(config, tmp_path, {})
 
 
-@pytest.mark.slow
-def test_a_run_begun_with_other_shapes_is_refused(report: dict, folder: Path) -> None:
-    config = small()
-    record = json.loads((folder / "public" / "run.json").read_text())
-    assert record["config"]["data"]["shapes"] == "solids:6"
-    config.data.shapes = "solids:5"
-    with pytest.raises(InputError, match=r"data\.shapes was 'solids:6', now 'solids:5'"):
-        public_vs_virtual(config, folder, {"virtual": folder / "virtual"}, progress=False)
-
-
 def test_a_checkpoint_of_pytorch_is_read_for_an_rpmnet_only(tmp_path: Path) -> None:
     weights = tmp_path / "weights.npz"
     np.savez(weights, unknown=np.zeros(3, np.float32))

@@ -10,14 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from experiments.studies.real_scans import study as real_scans
-from experiments.studies.real_scans.study import KnownScan, load_truth, main, make_parser
+from experiments.studies.real_scans.study import KnownScan, load_truth
 from experiments.studies.verdicts.challenge_parts import challenge_parts
 from experiments.studies.verdicts.depth_camera import measure, random_pose
 from vanejax.cad.symmetry import rotation_about
 from vanejax.errors import InputError
 from vanejax.rigid import RigidTransform
-from vanejax.scanner.virtual_scanner import Scanner
-from vanejax.scans.scan_file import save_points
+from vanejax.scanner import Scanner
+from vanejax.scans import save_points
 
 REAL = Path(__file__).parents[4] / "shared" / "data" / "real_scans"
 REAL_SCANS = load_truth(REAL) if REAL.is_dir() else []
@@ -44,9 +44,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_folder_becomes_a_table(folder: Path, tmp_path: Path, capsys) -> None:
-    report = main(make_parser().parse_args([str(folder), "--out", str(tmp_path)]))
-    assert json.loads((tmp_path / "real_scans.json").read_text()) == report
+def test_a_folder_becomes_a_table(folder: Path, record, capsys) -> None:
+    report = record(real_scans, "real_scans", str(folder))
     assert (report["scans"], report["right"], report["accepted_wrong"]) == (2, 2, 0)
     assert max(row["translation_mm"] for row in report["rows"]) < 5
     printed = capsys.readouterr().out
@@ -56,9 +55,8 @@ def test_a_folder_becomes_a_table(folder: Path, tmp_path: Path, capsys) -> None:
 
 
 @pytest.mark.slow
-def test_a_named_sensor_is_a_second_column(folder: Path, tmp_path: Path, capsys) -> None:
-    arguments = [str(folder), "--out", str(tmp_path), "--sensor", "consumer_depth"]
-    report = main(make_parser().parse_args(arguments))
+def test_a_named_sensor_is_a_second_column(folder: Path, record, capsys) -> None:
+    report = record(real_scans, "real_scans", str(folder), "--sensor", "consumer_depth")
     again = report["sensor"]
     assert (again["name"], again["scans"], again["right"]) == ("consumer_depth", 2, 2)
     for before, after in zip(report["rows"], again["rows"], strict=True):
@@ -115,9 +113,7 @@ def test_a_single_matrix_is_one_answer(tmp_path: Path) -> None:
         ([entry(scan_from_cad_mm=np.diag([1, 1, -1, 1]).tolist())], "mirror"),
     ],
 )
-def test_ground_truth_that_makes_no_sense_is_refused(
-    tmp_path: Path, truth: object, words: str
-) -> None:
+def test_ground_truth_that_makes_no_sense_is_refused(tmp_path, truth, words) -> None:
     (tmp_path / "ground_truth.json").write_text(json.dumps(truth))
     with pytest.raises(InputError, match=words):
         load_truth(tmp_path)
@@ -148,17 +144,12 @@ def test_an_accepted_wrong_pose_is_seen() -> None:
     assert real_scans.table(slow).splitlines()[-1].startswith("MISSED")
 
 
-@pytest.mark.parametrize(
-    "scan",
-    [
-        pytest.param(
-            scan,
-            marks=() if scan.scan.name in IN_DEFAULT_RUN else pytest.mark.slow,
-            id=scan.scan.name,
-        )
-        for scan in REAL_SCANS
-    ],
-)
+def as_case(scan: KnownScan):
+    name = scan.scan.name
+    return pytest.param(scan, marks=() if name in IN_DEFAULT_RUN else pytest.mark.slow, id=name)
+
+
+@pytest.mark.parametrize("scan", map(as_case, REAL_SCANS))
 def test_a_real_scan_is_within_5_deg_and_5_mm_from_no_guess(scan: KnownScan) -> None:
     """Scans of a depth camera: right, and never rejected."""
     (row,) = real_scans.measure([scan], seed=0)

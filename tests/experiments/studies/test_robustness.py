@@ -14,16 +14,9 @@ from experiments.runner.vane_views import perturb
 from experiments.studies.robustness import report as robustness_report
 from experiments.studies.robustness import study as robustness
 from experiments.studies.robustness.disturbances import Stand
-from experiments.studies.robustness.study import (
-    Trial,
-    make_parser,
-    parse_weights,
-    run_series,
-    summarize_random,
-)
-from vanejax.cad.parametric_vane import guide_vane
+from vanejax.cad import guide_vane
 from vanejax.errors import InputError
-from vanejax.plotting.canvas import save_figure
+from vanejax.plotting import save_figure
 
 
 def row(deg: float, mm: float) -> dict[str, Any]:
@@ -84,7 +77,7 @@ def test_random_scans_are_summed_up():
         found(98, 9.0, 4.0, "rejected"),
         found(99, 0.01, 0.01, "ambiguous"),
     ]
-    summary = summarize_random(rows)
+    summary = robustness.summarize_random(rows)
     assert summary["right"] == 0.98
     assert summary["accepted_wrong"] == 1
     assert summary["verdicts"]["rejected"] == {"right": 0, "wrong": 1}
@@ -124,18 +117,18 @@ def test_the_picture_has_a_panel_for_each_series_and_figure_11(report, tmp_path)
 @pytest.mark.parametrize("words", [[], ["vane.npz"], ["a=1.npz", "a=2.npz"], ["=x.npz"]])
 def test_weights_need_a_name_and_a_file(words):
     with pytest.raises(InputError, match="--weights"):
-        parse_weights(words)
+        robustness.parse_weights(words)
 
 
 def test_weights_keep_their_order():
-    files = parse_weights(["robust=b.npz", "ideal=a.npz"])
+    files = robustness.parse_weights(["robust=b.npz", "ideal=a.npz"])
     assert files == {"robust": Path("b.npz"), "ideal": Path("a.npz")}
     assert list(files) == ["robust", "ideal"]
-    assert make_parser().parse_args(["--weights", "a=b"]).views == 6
+    assert robustness.make_parser().parse_args(["--weights", "a=b"]).views == 6
 
 
 @pytest.fixture
-def trial(monkeypatch) -> Trial:
+def trial(monkeypatch) -> robustness.Trial:
     """A network that answers with its guess, and guesses that are nearly right."""
     part = guide_vane()
     points, normals, _ = part.sample(20_000, seed=0)
@@ -146,7 +139,7 @@ def trial(monkeypatch) -> Trial:
     monkeypatch.setattr(
         robustness, "_rough", lambda truth, part, rng: perturb(truth, part, deg=1, mm=1, rng=rng)
     )
-    return Trial(part, {"guess": network})
+    return robustness.Trial(part, {"guess": network})
 
 
 @pytest.mark.slow
@@ -154,7 +147,9 @@ def test_a_series_is_refined_and_stock_is_found_where_it_says_so(trial):
     every = {one.name: one for one in Stand(trial.part, seed=0).series(views=3)}
     found = {}
     for name in ("casting", "stock"):
-        report = run_series(trial, dataclasses.replace(every[name], values=(1.0,)), seed=0)
+        report = robustness.run_series(
+            trial, dataclasses.replace(every[name], values=(1.0,)), seed=0
+        )
         (step,) = report["steps"]
         assert step["value"] == 1.0
         for row in step["rows"]:
@@ -174,7 +169,7 @@ def test_a_series_is_refined_and_stock_is_found_where_it_says_so(trial):
 
 def test_refinement_is_what_the_table_says_it_is(trial):
     series = {one.name: one for one in Stand(trial.part, seed=0).series(views=1)}["noise"]
-    report = run_series(trial, dataclasses.replace(series, values=(0.0,)), seed=0)
+    report = robustness.run_series(trial, dataclasses.replace(series, values=(0.0,)), seed=0)
     (row,) = report["steps"][0]["rows"]
     fine = row["guess"]["refined"]
     assert fine["rotation_deg"] < 0.1

@@ -21,7 +21,7 @@ from experiments.studies.sensor_fit.sensor_statistics import (
     statistics,
     unlikeness,
 )
-from vanejax.cad.part import part_from_mesh
+from vanejax.cad import part_from_mesh
 from vanejax.errors import InputError
 from vanejax.localization import RayCasting, measurement_model
 from vanejax.scanner import Camera, Sensor, look_at, measure

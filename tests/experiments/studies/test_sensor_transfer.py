@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.studies.sensor_transfer import study as sensor_transfer
-from experiments.studies.sensor_transfer.study import IDEAL, NO_NETWORK, main, make_parser
+from experiments.studies.sensor_transfer.study import IDEAL, NO_NETWORK, make_parser
 from vanejax.cad import guide_vane
 from vanejax.scanner import Scanner, hemisphere_viewpoints, measure, preset
 from vanejax.scans import save_points
@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_a_good_network_and_a_bad_one_are_told_apart(
-    folder: Path, tmp_path: Path, monkeypatch, capsys
+    folder: Path, record, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     good = find_weights("pretrained", guide_vane())
     assert good is not None
@@ -51,8 +51,8 @@ def test_a_good_network_and_a_bad_one_are_told_apart(
         return good if config.online.effects else bad
 
     monkeypatch.setattr(sensor_transfer, "network", network)
-    arguments = [str(folder), "--out", str(tmp_path), "--starts", "3", "--steps", "7"]
-    report = main(make_parser().parse_args([*arguments, "--sensor", "paper_camera"]))
+    arguments = ["--starts", "3", "--steps", "7", "--sensor", "paper_camera"]
+    report = record(sensor_transfer, "sensor_transfer", str(folder), *arguments)
     assert asked == [(False, tmp_path / "part_ideal"), (True, tmp_path / "part_paper_camera")]
     found = report["summary"]["all"]
     assert found["paper_camera"]["alone"]["right"] == 1.0
@@ -63,7 +63,6 @@ def test_a_good_network_and_a_bad_one_are_told_apart(
     assert report["summary"]["part"] == found
     assert report["scans"] == {"scan.ply": found}
     assert found[IDEAL]["alone"]["registrations"] == 3
-    assert json.loads((tmp_path / "sensor_transfer.json").read_text()) == report
     printed = capsys.readouterr().out
     assert sensor_transfer.table(report) in printed
     assert "| paper_camera | all | 3 of 3 |" in printed

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from experiments.studies.verdicts import study
 from experiments.studies.verdicts.challenge_parts import VANE, challenge_parts, names_of_parts
 from experiments.studies.verdicts.report import area_under_roc, picture, roc, summarize, table
-from experiments.studies.verdicts.study import (
-    OTHER_PART,
-    RIGHT,
-    main,
-    make_parser,
-    other_parts,
-)
+from experiments.studies.verdicts.study import OTHER_PART, RIGHT, other_parts
 from experiments.studies.verdicts.wrong_poses import (
     MOST_POINTS,
     SENSORS,
@@ -26,12 +20,9 @@ from experiments.studies.verdicts.wrong_poses import (
     wrong_poses,
 )
 from vanejax.errors import InputError
-from vanejax.localization.assessment import assess
-from vanejax.localization.fine_registration import refine
+from vanejax.localization import RayCasting, assess, measurement_model, refine, register
 from vanejax.localization.pose_batch import stack
-from vanejax.localization.registration import register
-from vanejax.localization.residuals import RayCasting, measurement_model
-from vanejax.scans.measured_scan import MeasuredScan
+from vanejax.scans import MeasuredScan
 
 
 @pytest.fixture(scope="module")
@@ -209,10 +200,8 @@ def test_what_is_reported() -> None:
 
 
 @pytest.mark.slow
-def test_the_study_runs(tmp_path: Path, capsys) -> None:
-    arguments = ["--parts", "box,wedge", "--sensors", "white", "--out", str(tmp_path)]
-    report = main(make_parser().parse_args(arguments))
-    assert json.loads((tmp_path / "verdicts.json").read_text()) == report
+def test_the_study_runs(record, tmp_path: Path, capsys) -> None:
+    report = record(study, "verdicts", "--parts", "box,wedge", "--sensors", "white")
     assert (tmp_path / "verdicts.png").stat().st_size > 10_000
     assert report["poses"]["right"] == 2
     assert report["poses"]["wrong"] > 4
@@ -221,9 +210,8 @@ def test_the_study_runs(tmp_path: Path, capsys) -> None:
     assert "register, no guess" in capsys.readouterr().out
 
 
-def test_unknown_names_are_refused(tmp_path: Path) -> None:
-    parser = make_parser()
+def test_unknown_names_are_refused(record) -> None:
     with pytest.raises(InputError, match="no sensor lidar"):
-        main(parser.parse_args(["--sensors", "lidar", "--out", str(tmp_path)]))
+        record(study, "verdicts", "--sensors", "lidar")
     with pytest.raises(InputError, match="no challenge part"):
-        main(parser.parse_args(["--parts", "spoon", "--out", str(tmp_path)]))
+        record(study, "verdicts", "--parts", "spoon")
