@@ -11,7 +11,7 @@ from example_result import pose
 from scipy.spatial.transform import Rotation
 
 import vanejax
-from vanejax.cad import Part, guide_vane, part_from_mesh
+from vanejax.cad import guide_vane, part_from_mesh
 from vanejax.errors import InputError
 from vanejax.machine.controllers import Compensation
 from vanejax.machine.frame_notation import read_kuka, write_kuka
@@ -30,10 +30,8 @@ from vanejax.scans.measured_scan import clean_scan
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
-@pytest.fixture(scope="module")
-def box() -> Part:
-    mesh = trimesh.creation.box((40.0, 60.0, 10.0))
-    return part_from_mesh(mesh.vertices, mesh.faces, name="box")
+MESH = trimesh.creation.box((40.0, 60.0, 10.0))
+BOX = part_from_mesh(MESH.vertices, MESH.faces, name="box")
 
 
 @pytest.mark.slow
@@ -74,8 +72,8 @@ def test_a_displaced_vane_is_hit_and_without_compensation_missed() -> None:
     assert np.einsum("ni,ni->n", moved["part"].axes, true_axes).min() > np.cos(np.radians(0.02))
 
 
-def test_a_raster_covers_a_box_to_and_fro(box: Part) -> None:
-    path = raster_path(box, towards=3 * DOWN, spacing_mm=4.0)
+def test_a_raster_covers_a_box_to_and_fro() -> None:
+    path = raster_path(BOX, towards=3 * DOWN, spacing_mm=4.0)
     assert len(path.points) == 10 * 15
     np.testing.assert_allclose(path.points[:, 2], 5.0, rtol=0, atol=1e-5)
     np.testing.assert_array_equal(path.axes, np.tile([0.0, 0, 1], (150, 1)))
@@ -106,16 +104,16 @@ def test_a_raster_leaves_out_steep_faces_and_what_is_hidden() -> None:
         ([0.0, 0.0, -1.0], 300.0, "no face is reached"),
     ],
 )
-def test_a_raster_that_makes_no_sense(box: Part, towards: list, spacing: float, words: str) -> None:
+def test_a_raster_that_makes_no_sense(towards: list, spacing: float, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        raster_path(box, towards=np.array(towards), spacing_mm=spacing)
+        raster_path(BOX, towards=np.array(towards), spacing_mm=spacing)
 
 
-def test_the_sign_is_positive_outside(box: Part) -> None:
+def test_the_sign_is_positive_outside() -> None:
     machine_from_part = pose((10.0, 20.0, 30.0), (100.0, 200.0, 300.0))
     points = np.array([[0.0, 0, 5.25], [0, 0, 4.5], [20.03, 0, 0], [0, 0, 5]])
     found = tool_path_deviation(
-        machine_from_part.apply(points), box, machine_from_part, tolerance_mm=0.05
+        machine_from_part.apply(points), BOX, machine_from_part, tolerance_mm=0.05
     )
     np.testing.assert_allclose(found.signed_mm, [0.25, -0.5, 0.03, 0], rtol=0, atol=1e-9)
     assert (found.largest_mm, found.share_within) == (pytest.approx(0.5), 0.5)
@@ -131,11 +129,9 @@ def test_the_sign_is_positive_outside(box: Part) -> None:
         (np.zeros((1, 3)), 0.0, "tolerance 0.0 mm"),
     ],
 )
-def test_deviations_of_nonsense(
-    box: Part, points: np.ndarray, tolerance: float, words: str
-) -> None:
+def test_deviations_of_nonsense(points: np.ndarray, tolerance: float, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        tool_path_deviation(points, box, pose((0, 0, 0), (0, 0, 0)), tolerance_mm=tolerance)
+        tool_path_deviation(points, BOX, pose((0, 0, 0), (0, 0, 0)), tolerance_mm=tolerance)
 
 
 @pytest.mark.parametrize("with_axes", [True, False])

@@ -1,10 +1,8 @@
 """Turbine airfoil sections by Pritchard's eleven-parameter model (ASME 85-GT-219, 1985).
 
-The plane of a section is the unrolled cylinder: axial (downstream), then tangential. Angles are
-metal angles from the axial direction, positive towards positive tangential. The origin is the
-centre of the trailing edge's circle; the leading edge lies at negative axial and positive
-tangential coordinates, and the suction side faces positive tangential. Nine parameters are fields
-of `Airfoil`; radius and number of blades enter only through the pitch.
+The plane of a section is the unrolled cylinder: axial (downstream), then tangential, to which the
+suction side faces. The origin is the centre of the trailing edge's circle. Angles are metal angles
+from the axial direction, positive towards positive tangential.
 """
 
 from __future__ import annotations

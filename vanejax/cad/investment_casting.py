@@ -1,9 +1,7 @@
 """The part as it is cast: machining stock, waviness and distortion that its CAD model lacks.
 
-An investment casting comes out of its shell with stock left for machining, with a surface that
-waves by tenths of a millimetre, and bent by uneven cooling. `as_cast` moves the CAD surface along
-its normals by a smooth random field, and bends the whole, in the CAD model's own frame: a pose
-found on a scan of the casting is compared with the CAD model's.
+All in the CAD model's own frame: a pose found on a scan of the casting is compared with the CAD
+model's.
 """
 
 from __future__ import annotations
@@ -58,13 +56,13 @@ class InvestmentCasting:
     bow_mm: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("allowance_mm", "waviness_mm", "wavelength_mm", "bow_mm"):
-            if not math.isfinite(getattr(self, name)):
-                raise InputError(f"casting {name} must be finite, got {getattr(self, name)!r}")
+        for name, value in vars(self).items():
+            if not math.isfinite(value):
+                raise InputError(f"casting {name} must be finite, got {value!r}")
         for name in ("waviness_mm", "bow_mm"):
-            if getattr(self, name) < 0:
+            if (value := getattr(self, name)) < 0:
                 raise InputError(
-                    f"casting {name} must be 0 mm or more, got {getattr(self, name)!r}; "
+                    f"casting {name} must be 0 mm or more, got {value!r}; "
                     "its sign is drawn at random"
                 )
         if self.wavelength_mm <= 0:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -22,8 +22,7 @@ FIRST_FACES = 8  # of each size, looked at for each point
 TIE_MM = 1e-9  # points as near as this are one: rounding at 1 m is 1e-13
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class ClosestPoints:
+class ClosestPoints(NamedTuple):
     """The nearest surface points of n points.
 
     Attributes:
@@ -36,10 +35,14 @@ class ClosestPoints:
     normals: np.ndarray
     face: np.ndarray
 
+    def at(self, index: np.ndarray) -> ClosestPoints:
+        """Those of an index [m]."""
+        return ClosestPoints(*(column[index] for column in self))
+
     def put(self, which: np.ndarray, better: ClosestPoints) -> None:
         """Takes those of the indices ``which`` from ``better``."""
-        self.points[which], self.normals[which] = better.points, better.normals
-        self.face[which] = better.face
+        for column, values in zip(self, better, strict=True):
+            column[which] = values
 
 
 class Surface:
@@ -47,7 +50,8 @@ class Surface:
 
     def __init__(self, part: Part) -> None:
         self.part = part
-        self.points, self.normals, self.face = part.sample(SAMPLES, seed=0)
+        self._samples = ClosestPoints(*part.sample(SAMPLES, seed=0))
+        self.points, self.normals, self.face = self._samples
         self._tree = cKDTree(self.points)
 
     @functools.cached_property
@@ -89,13 +93,11 @@ class Surface:
         low, size, nearest = self._grid
         cell = ((points - low) / size).astype(np.int64)
         np.clip(cell, 0, np.array(nearest.shape) - 1, out=cell)
-        index = nearest[tuple(cell.T)]
-        return ClosestPoints(self.points[index], self.normals[index], self.face[index])
+        return self._samples.at(nearest[tuple(cell.T)])
 
     def nearest(self, points: np.ndarray) -> ClosestPoints:
         """The sample nearest to each point [n, 3]: right to about the samples' spacing."""
-        _, index = self._tree.query(points)
-        return ClosestPoints(self.points[index], self.normals[index], self.face[index])
+        return self._samples.at(self._tree.query(points)[1])
 
     def exact(self, points: np.ndarray) -> ClosestPoints:
         """The foot points on the faces of the nearest few samples, to rounding.
@@ -109,15 +111,13 @@ class Surface:
         closest = closest.reshape(-1, CANDIDATES, 3)
         best = np.argmin(np.sum((closest - points[:, None]) ** 2, axis=-1), axis=1)
         rows = np.arange(len(points))
-        chosen = index[rows, best]
-        return ClosestPoints(closest[rows, best], self.normals[chosen], self.face[chosen])
+        return self._samples.at(index[rows, best])._replace(points=closest[rows, best])
 
 
 class NearestFace:
     """Nearest points on a part's surface, to rounding, whatever the size and shape of its faces.
 
-    `Surface.exact` is quicker, and right to a face's size, which on the long thin faces of a flat
-    side can be a millimetre.
+    `Surface.exact` is quicker, and right to a face's size: a millimetre on long thin faces.
 
     Faces are sorted by size, a search tree over the middles of each size. A face of radius r about
     its middle can be no nearer than the middle less r, so that the search ends when the next middle
@@ -146,8 +146,7 @@ class NearestFace:
         """
         size = PAIRS_AT_ONCE // FIRST_FACES
         blocks = [self._nearest_of(points[i : i + size]) for i in range(0, len(points), size)]
-        columns = zip(*((b.points, b.normals, b.face) for b in blocks), strict=True)
-        return ClosestPoints(*map(np.concatenate, columns))
+        return ClosestPoints(*map(np.concatenate, zip(*blocks, strict=True)))
 
     def _nearest_of(self, points: np.ndarray) -> ClosestPoints:
         best = np.full(len(points), np.inf)

@@ -48,9 +48,8 @@ def dihedral(
 class DenseSurface:
     """Distances to a part's surface by dense samples that stand for small discs.
 
-    A sample counts as a disc of its normal with as much radius as samples are apart, so a part's
-    exact symmetries give no more than the sag of its facets; the price is that an edge seems to
-    reach that much (0.3 to 0.6 mm) farther.
+    With discs as large as samples are apart, a part's exact symmetries give no more than the sag of
+    its facets; the price is that an edge seems to reach that much (0.3 to 0.6 mm) farther.
     """
 
     def __init__(self, part: Part) -> None:

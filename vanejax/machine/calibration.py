@@ -1,9 +1,7 @@
 """Where the camera stands in the frame of a measuring machine, from a cube that both measured.
 
 Section IV.B.2 of the paper: three faces of a cube are scanned by the camera and touched by the
-machine's probe, at several placements. The paper puts one matrix of each placement together:
-`averaged`. `calibrate` asks for the one motion that brings all planes onto each other, each
-weighted by how well it is known; the cube need not be square. Host code, float64, mm.
+machine's probe, at several placements. The cube need not be square. Host code, float64, mm.
 """
 
 from __future__ import annotations
@@ -179,11 +177,9 @@ def _aligned(
 def _disagreement(
     seen: Face, touched: Face, center: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residual [3], its derivative [3, 6] by a small motion of ``seen`` about ``center``, and its
-    covariance [3, 3]; both faces in the machine's frame.
+    """Residual [3], its derivative [3, 6] by a small motion of ``seen``, its covariance [3, 3].
 
-    Tilts ``U^T (n_b - n)`` in the touched plane's own axes U, then ``n . (x_b - x)`` at the middle
-    x_b of the touched points.
+    Tilts ``U^T (n_b - n)`` in the touched plane's own axes U, then ``n . (x_b - x)`` at its middle.
     """
     normal, away = seen.normal, touched.center - seen.center
     axes = np.linalg.svd(touched.normal[None])[2][1:]  # [2, 3], U^T

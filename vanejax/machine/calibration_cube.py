@@ -1,7 +1,6 @@
 """A calibration cube: planes through the points of its faces, and the frame that three of them fix.
 
-A face's plane holds the points x with ``n . (x - center) = 0``. The frame is whatever the points
-are in. Host code, float64, mm.
+All is in the frame of the points. Host code, float64, mm.
 """
 
 from __future__ import annotations
@@ -76,14 +75,11 @@ class Cube(NamedTuple):
     def moved(self, target_from_this: RigidTransform) -> Cube:
         """The same in another frame."""
         turn, shift = target_from_this
-        faces = (
-            face._replace(
-                normal=turn @ face.normal,
-                center=turn @ face.center + shift,
-                normal_covariance=turn @ face.normal_covariance @ turn.T,
-            )
-            for face in self.faces
-        )
+        faces = []
+        for face in self.faces:
+            tilt = turn @ face.normal_covariance @ turn.T
+            center = turn @ face.center + shift
+            faces.append(Face(turn @ face.normal, center, tilt, *face[3:]))
         return Cube(tuple(faces))
 
 

@@ -1,9 +1,8 @@
 """Where a part sits in a machine, and how far a program is off.
 
-Frames. ``machine`` is the base frame of the controller: $WORLD of a robot, the machine's coordinate
-system of a milling machine; ``part`` is that of the CAD model, which the program counts from.
-``machine_from_part`` is the work frame; `vanejax.machine.frame_notation` says it in the
-controller's words. Millimetres and degrees; host numpy only.
+``machine`` is the base frame of the controller: $WORLD of a robot, the machine's coordinate system
+of a milling machine; ``part`` is that of the CAD model, which the program counts from, and
+``machine_from_part`` the work frame. Millimetres and degrees; host numpy only.
 """
 
 from __future__ import annotations

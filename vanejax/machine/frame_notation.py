@@ -1,8 +1,7 @@
 """Frames in the notation of controllers: KUKA, ISO G-code, Heidenhain, Siemens, plain matrices.
 
-What is written is rounded to `DECIMALS_MM` and `DECIMALS_DEG`;
-`vanejax.machine.controllers.rounding_error_mm` gives the displacement by that. A reader raises
-`InputError` where a component is missing, repeated, unknown or no number. Millimetres and degrees.
+What is written is rounded. A reader raises `InputError` where a component is missing, repeated,
+unknown or no number. Millimetres and degrees.
 """
 
 from __future__ import annotations

@@ -1,13 +1,8 @@
 """How far a part was turned and moved between two registrations, and how well that is known.
 
-Section IV of the paper. Two registrations of a fixed camera give the motion of the part in the
-camera's frame. It is projected on a known axis, to be compared with a rotary stage, or carried to
-the frame of a measuring machine (eq. 13), to be compared with probed points (eq. 12).
-
-A small motion e [6] is (rotation vector in rad, translation in mm) about a centre c, applied
-afterwards: ``x -> c + exp(e[:3]) (x - c) + e[3:]``. As in
-`vanejax.localization.pose_result.Uncertainty`, the truth is that small motion after what is
-reported. All is first order in it. Host code, float64.
+Section IV of the paper, whose camera is fixed. An error e [6] is a small motion about a centre c,
+after what is reported, as in `vanejax.localization.pose_result.Uncertainty`:
+``x -> c + exp(e[:3]) (x - c) + e[3:]``, (rad, mm); all is first order in it. Host code, float64.
 """
 
 from __future__ import annotations
