@@ -22,7 +22,7 @@ from vanejax.plotting.canvas import (
     new_figure,
     style_chart,
 )
-from vanejax.plotting.casting import casting_map
+from vanejax.plotting.deviation import casting_map
 from vanejax.plotting.matching import Matching, matching_lines
 from vanejax.plotting.sensing import segments_picture
 from vanejax.rigid import RigidTransform

@@ -12,7 +12,7 @@ from example_scans import vane
 from vanejax.cad import Part, part_from_mesh
 from vanejax.cad.investment_casting import CUT, InvestmentCasting, as_cast, waviness
 from vanejax.errors import InputError
-from vanejax.plotting.casting import casting_map
+from vanejax.plotting.deviation import casting_map
 from vanejax.scanner import Camera, Scanner, hemisphere_viewpoints
 
 NOTHING = InvestmentCasting(allowance_mm=0, waviness_mm=0)

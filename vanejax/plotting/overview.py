@@ -68,7 +68,12 @@ def overview_picture(portrait: Scan, camera: Camera, scan: Scan, overlay: Overla
     error = f"{overlay.rotation_error_deg:.2f}°, {overlay.translation_error_mm:.2f} mm error"
     _caption(panels[3], "after registration", [(error, INK)])
     for left, right in itertools.pairwise(panels):
-        _arrow(figure, left, right)
+        figure.add_artist(
+            ConnectionPatch(
+                (1.0, 0.5), (0.0, 0.5), "axes fraction", "axes fraction", axesA=left, axesB=right,
+                arrowstyle="-|>", color=FAINT, linewidth=1.2, mutation_scale=9,
+            )
+        )  # fmt: skip
     return figure
 
 
@@ -86,13 +91,3 @@ def _caption(axes: Axes, title: str, words: list[tuple[str, str]]) -> None:
             borderpad=0.1,
         )
     )
-
-
-def _arrow(figure: Figure, left: Axes, right: Axes) -> None:
-    """From one panel to the next."""
-    figure.add_artist(
-        ConnectionPatch(
-            (1.0, 0.5), (0.0, 0.5), "axes fraction", "axes fraction", axesA=left, axesB=right,
-            arrowstyle="-|>", color=FAINT, linewidth=1.2, mutation_scale=9,
-        )
-    )  # fmt: skip
