@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from vanejax.matching.se3 import exp_se3
 from vanejax.pointcloud import PointCloud, ball_query, squared_distances, voxel_thin
 from vanejax.rigid import RigidTransform
 
@@ -43,29 +40,6 @@ def test_ball_query_is_the_loop(grid, mask, num_neighbors):
     found = query(xyz, mask, radius=0.625, num_neighbors=num_neighbors)
     assert found.dtype == jnp.int32
     assert found.tolist() == neighbors_by_loop(xyz, mask, 0.625, num_neighbors)
-
-
-def test_ball_query_takes_the_first_not_the_nearest():
-    xyz = np.array([[0, 0, 0], [0.29, 0, 0], [0.2, 0, 0], [0.01, 0, 0], [9, 9, 9]], np.float32)
-    every = np.ones(5, bool)
-    found = query(xyz, every, radius=0.3, num_neighbors=2).tolist()
-    assert found[0] == [1, 2]
-    assert found[4] == [4, 4]  # alone: filled with itself
-    masked = query(xyz, np.array([1, 0, 1, 1, 1], bool), radius=0.3, num_neighbors=4).tolist()
-    assert masked[0] == [2, 3, 0, 0]
-
-
-def test_ball_query_ignores_rigid_motion_and_follows_permutation():
-    rng = np.random.default_rng(0)
-    xyz = rng.uniform(-1, 1, (12, 3)).astype(np.float32)
-    every = np.ones(12, bool)
-    ask = functools.partial(query, radius=0.625, num_neighbors=20)
-    found = np.asarray(ask(xyz, every))
-    moved = exp_se3(jnp.array([0.3, -0.2, 0.9, 1, 2, 3])).apply(xyz)
-    np.testing.assert_array_equal(ask(moved, every), found)
-    order = rng.permutation(12)
-    for row, source in zip(np.asarray(ask(xyz[order], every)), order, strict=True):
-        assert set(order[row]) == set(found[source])
 
 
 def test_squared_distances_far_from_the_origin():
@@ -118,19 +92,6 @@ def test_thinning_keeps_one_point_of_each_occupied_voxel(points, voxel_mm, seed)
     permuted = voxel_thin(points[order], voxel_mm=voxel_mm)
     # ties between equally near points may fall the other way: the voxels may not
     assert {cells[i] for i in order[permuted]} == set(cells)
-
-
-def test_thinning_does_not_depend_on_the_order_of_the_points():
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-20, 20, (3000, 3))
-    _, counts = np.unique(np.floor(points / 7.0), axis=0, return_counts=True)
-    assert counts.min() > 2  # of two points both are as near to their mean
-
-    def thinned(points):
-        return {tuple(point) for point in points[voxel_thin(points, voxel_mm=7.0)]}
-
-    assert len(thinned(points)) == len(counts)
-    assert thinned(points) == thinned(points[::-1]) == thinned(rng.permutation(points))
 
 
 @pytest.mark.parametrize("shift", [0.0, 1e6, -1e6])

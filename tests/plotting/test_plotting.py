@@ -21,6 +21,7 @@ from vanejax.cad import part_from_mesh
 from vanejax.errors import InputError
 from vanejax.plotting.canvas import CAD, SCAN
 from vanejax.plotting.clouds import seen_and_hidden
+from vanejax.plotting.matching import Matching, matching_lines
 from vanejax.plotting.shading import crop
 from vanejax.scanner import Camera, Scan, Scanner, hemisphere_viewpoints
 
@@ -89,6 +90,13 @@ def texts(figure: Figure) -> list[str]:
 # ---------------------------------------------------------------- every figure
 
 
+def matchings(count: int) -> Figure:
+    cloud = overlay().true
+    return matching_lines(
+        {f"after {number} steps": Matching(cloud, cloud, np.eye(20)) for number in range(count)}
+    )
+
+
 def every_figure(scans: list[Scan]) -> dict[str, Figure]:
     failed = dataclasses.replace(overlay(), moved=np.full((20, 3), np.nan))
     return {
@@ -107,6 +115,7 @@ def every_figure(scans: list[Scan]) -> dict[str, Figure]:
         "views": plotting.view_and_shadow(scans, [plotting.view_name(60, 20)] * 4),
         "part": plotting.part_picture(scans[0], CAMERA),
         "overview": plotting.overview_picture(scans[0], CAMERA, scans[1], overlay()),
+        **{f"{count} matchings": matchings(count) for count in (1, 2, 3)},
     }
 
 
@@ -119,17 +128,19 @@ def test_nothing_is_clipped_and_no_titles_overlap(scans: list[Scan]) -> None:
             figure.draw_without_rendering()
     for name, figure in figures.items():
         page = figure.bbox
-        titles = []
+        words = [text for legend in figure.legends for text in legend.get_texts()]
         for axes in figure.axes:
-            for text in (axes.title, axes._left_title, axes.xaxis.label, axes.yaxis.label):
-                if not text.get_text().strip():
-                    continue
-                box = text.get_window_extent()
-                # half a pixel of rounding
-                inside = box.x0 > -0.5 and box.y0 > -0.5
-                inside &= box.x1 < page.x1 + 0.5 and box.y1 < page.y1 + 0.5
-                assert inside, f"{name}: {text.get_text()!r} is clipped"
-                titles.append((text.get_text(), box))
+            words += [axes.title, axes._left_title, axes.xaxis.label, axes.yaxis.label]
+        titles = []
+        for text in words:
+            if not text.get_text().strip():
+                continue
+            box = text.get_window_extent()
+            # half a pixel of rounding
+            inside = box.x0 > -0.5 and box.y0 > -0.5
+            inside &= box.x1 < page.x1 + 0.5 and box.y1 < page.y1 + 0.5
+            assert inside, f"{name}: {text.get_text()!r} is clipped"
+            titles.append((text.get_text(), box))
         for index, (text, box) in enumerate(titles):
             for other, other_box in titles[:index]:
                 assert not box.overlaps(other_box), f"{name}: {text!r} overlaps {other!r}"
@@ -244,15 +255,6 @@ def test_seen_and_hidden_points_lie_on_the_part(scans: list[Scan]) -> None:
     assert not (np.abs(seen[:, 2] + 20) < 1e-3)[np.abs(seen[:, :2]).max(axis=1) < 29].any()
 
 
-def test_clouds_that_are_missing_are_named(scans: list[Scan]) -> None:
-    with pytest.raises(InputError, match="hidden=True"):
-        plotting.view_and_shadow([dataclasses.replace(scans[0], hidden=None)], ["view"])
-    with pytest.raises(InputError, match="at least one scan"):
-        plotting.view_and_shadow([], [])
-    with pytest.raises(InputError, match="at least one registration"):
-        plotting.registration_overlays([])
-
-
 # ---------------------------------------------------------------- shaded pictures
 
 
@@ -284,11 +286,6 @@ def test_the_picture_is_cropped_to_the_part_with_true_proportions(scans: list[Sc
     assert columns.start < column.min() <= column.max() < columns.stop
     axes = plotting.part_picture(scans[0], CAMERA).axes[0]
     assert axes.get_aspect() == pytest.approx(CAMERA.fx / CAMERA.fy)
-
-
-def test_another_cameras_scan_is_refused(scans: list[Scan]) -> None:
-    with pytest.raises(InputError, match="another camera"):
-        plotting.shade(scans[0], CAMERA.scaled(0.3))
 
 
 # ---------------------------------------------------------------- charts
@@ -361,12 +358,21 @@ def test_the_smooth_curve_of_an_exponential_is_itself() -> None:
     np.testing.assert_allclose(smooth[5:-5], expected[5:-5], rtol=1e-9)  # f64 sums of 400
 
 
-@pytest.mark.parametrize("rows", [[], [{"step": 1}], [{"step": 1, "gradient_norm": 1.0}]])
-def test_a_log_without_anything_to_draw_is_refused(rows: list[dict[str, float]]) -> None:
-    with pytest.raises(InputError, match="no loss"):
-        plotting.training_curves(rows)
-
-
-def test_no_series_is_refused() -> None:
-    with pytest.raises(InputError, match="at least one series"):
-        plotting.axis_errors({})
+def test_what_cannot_be_drawn_is_refused(scans: list[Scan]) -> None:
+    scan = scans[0]
+    for words, draw in (
+        (
+            "hidden=True",
+            lambda: seen_and_hidden(dataclasses.replace(scan, hidden=None), voxel_mm=1),
+        ),
+        ("at least one scan", lambda: plotting.view_and_shadow([], [])),
+        ("at least one registration", lambda: plotting.registration_overlays([])),
+        ("at least one registration", lambda: plotting.method_displacements({})),
+        ("at least one series", lambda: plotting.axis_errors({})),
+        ("at least one matching", lambda: matching_lines({})),
+        ("another camera", lambda: plotting.shade(scan, CAMERA.scaled(0.3))),
+        ("no loss", lambda: plotting.training_curves([])),
+        ("no loss", lambda: plotting.training_curves([{"step": 1, "gradient_norm": 1.0}])),
+    ):
+        with pytest.raises(InputError, match=words):
+            draw()

@@ -1,7 +1,7 @@
 """The pages: every command is one that its program takes, every link leads somewhere.
 
 What is cheap is run as written (the quick start, the Python of `RUN`); of what takes long, the
-program and its own parser are asked. `test_readme` and `test_compensate` run their own pages.
+program and its own parser are asked. `test_compensate` runs its own page.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import FunctionType
 
+import numpy as np
 import pytest
 import registration_contract
 import test_verdict
@@ -446,3 +447,58 @@ def test_the_method_of_the_page_keeps_the_contract() -> None:
     case = registration_contract.Case(space["pca"])
     for law in registration_contract.LAWS:
         law(case)
+
+
+# ---- the README: short, its first screen, and everything that it shows runs as it is written
+
+README = (ROOT / "README.md").read_text()
+
+
+def readme(language: str) -> list[str]:
+    return [code for _, code in blocks(README, language)]
+
+
+def test_it_is_short_and_starts_with_the_picture_and_the_two_commands() -> None:
+    assert len(README.split()) <= 1500
+    first_screen = README.partition("\n## ")[0]
+    assert len(first_screen.splitlines()) < 35
+    assert "](docs/overview.png)" in first_screen
+    train, test = readme("sh")[0].splitlines()
+    assert readme("sh")[0] in first_screen
+    assert train.endswith("-m experiments.train --config vane.py")
+    # one line, as .ci/run takes it
+    assert re.fullmatch(r"python3 -m venv .* install .*'\.\[test\]' .*-m pytest", test)
+
+
+def test_the_commands_register_a_scan(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    (block,) = [b for b in readme("sh") if "vanejax register" in b]
+    run = [words[1:] for words in commands(block) if words[0] == "vanejax"]
+    assert [command[0] for command in run] == ["scan", "register"]
+    for command in run:
+        assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("scans: 6 scans")
+    for line in readme("text")[0].splitlines():  # but for the last digits of another processor
+        assert re.sub(r"\d+", "#", line) in re.sub(r"\d+", "#", printed)
+    pose = np.array(json.loads(Path("pose.json").read_text())["part_from_camera"])
+    label = json.loads(Path("scans/labels.json").read_text())["views"][0]
+    truth = np.linalg.inv(np.array(label["camera_from_part"]))
+    np.testing.assert_allclose(pose, truth, atol=0.01)  # 400 mm times 1e-5 rad, and 0.0003 mm
+    assert Path("pose.html").stat().st_size > 10_000
+
+
+@pytest.mark.slow  # 216 scans, and the compilation of a training step
+def test_the_core_runs() -> None:
+    (code,) = readme("python")
+    assert len(code.splitlines()) <= 17
+    space: dict = {}
+    exec(compile(code, "README.md", "exec"), space)
+    assert (len(space["scans"].train), len(space["scans"].test)) == (162, 54)
+    assert int(space["state"].step) == 1
+    assert np.isfinite(float(space["metrics"]["loss"]))
+    result = space["result"]
+    assert result.verdict.status == "accepted"
+    placed = result.part_from_camera.apply(space["scan"].points[:100])
+    true = space["views"].view(20).inverse().apply(space["scan"].points[:100])
+    np.testing.assert_allclose(placed, true, atol=0.01)  # mm, no noise
