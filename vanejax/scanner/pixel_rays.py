@@ -101,16 +101,10 @@ class PixelRays:
 
 
 class MeasuredPixels:
-    """The pixels that see the part, in arrays that are filled strip by strip.
+    """The arrays of a `Scan`, which are filled strip by strip.
 
-    The arrays begin as long as there are rays and are cut to length in place: to copy them would
-    cost as much as all arithmetic.
-
-    Attributes:
-      points: [N, 3] f32, mm, camera frame.
-      normals: [N, 3] f32, unit, camera frame.
-      face: [N] i32.
-      pixel: [N] i32, ``row * camera.width + column``.
+    They begin as long as there are rays and are cut to length in place: to copy them would cost as
+    much as all arithmetic.
     """
 
     def __init__(self, rays: int) -> None:

@@ -78,9 +78,7 @@ def _best_plane(middle: np.ndarray, part: Part, rng: np.random.Generator) -> Pla
         normal = np.linalg.eigh((near - mean).T @ (near - mean))[1][:, 0]
         offset = float(normal @ mean)
         height = np.abs(middle @ normal - offset)
-        close = height[height <= 2 * plane.thickness_mm]
-        sigma = float(robust_sigma(close)) if len(close) else 0.0
-        plane = Plane(normal, offset, _thickness_mm(sigma, part))
+        plane = Plane(normal, offset, _thickness_mm(height, plane.thickness_mm, part))
     return plane
 
 
@@ -89,12 +87,14 @@ def with_noise_thickness(plane: Plane, points: np.ndarray, part: Part) -> Plane:
     height = np.abs(plane.height_mm(points))
     thickness = 2 * PLANE_REACH * part.radius
     for _ in range(3):
-        sigma = float(robust_sigma(height[height <= 2 * thickness]))
-        thickness = _thickness_mm(sigma, part)
+        thickness = _thickness_mm(height, thickness, part)
     return dataclasses.replace(plane, thickness_mm=thickness)
 
 
-def _thickness_mm(sigma_mm: float, part: Part) -> float:
+def _thickness_mm(height: np.ndarray, thickness_mm: float, part: Part) -> float:
+    """From the noise of points at heights [N] mm, above 0, from a plane so thick so far."""
+    close = height[height <= 2 * thickness_mm]
+    sigma_mm = float(robust_sigma(close)) if len(close) else 0.0
     least, most = LEAST_THICKNESS * part.radius, MOST_THICKNESS * part.radius
     return float(np.clip(THICKNESS_SIGMAS * sigma_mm, least, most))
 
