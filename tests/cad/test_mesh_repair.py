@@ -143,6 +143,12 @@ def with_a_fin() -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([box().vertices, [[0.0, 0, 90]]]), [*box().faces, [a, b, 8]]
 
 
+def with_a_coordinate(value: float) -> tuple[np.ndarray, np.ndarray]:
+    vertices = np.array(BOX.vertices)
+    vertices[5, 1] = value
+    return vertices, BOX.faces
+
+
 SQUARE = [[0.0, 0, 0], [50, 0, 0], [50, 50, 0], [0, 50, 0]]
 SLIVER = [[0.0, 0, 0], [100, 0, 0], [0, 1e-4, 0]]  # narrower than the welding's reach
 
@@ -161,36 +167,21 @@ SLIVER = [[0.0, 0, 0], [100, 0, 0], [0, 1e-4, 0]]  # narrower than the welding's
         ),
         (both(box(at=(2e4, 0, 0))), "single precision rounds"),
         (both(*(box((1, 1, 1), at=(2 * i, 0, 0)) for i in range(257))), "257 separate bodies"),
+        (with_a_coordinate(np.nan), r"1 of 8 vertices are not finite .*vertex 5\)"),
+        (with_a_coordinate(np.inf), r"1 of 8 vertices are not finite .*vertex 5\)"),
+        # arrays that are no mesh
+        ((np.zeros((0, 3)), np.zeros((0, 3), int)), "has no faces"),
+        ((np.zeros((4, 3)), np.zeros((0, 3), int)), "has no faces"),
+        ((np.zeros((4, 2)), [[0, 1, 2]]), r"vertices have shape \(4, 2\)"),
+        ((np.zeros((4, 3)), [[0, 1, 2, 3]]), r"faces have shape \(1, 4\)"),
+        ((np.zeros((4, 3)), [[0.0, 1, 2]]), "not integer"),
+        ((np.zeros((4, 3)), [[0, 1, 4]]), r"outside 0\.\.3"),
+        ((np.zeros((4, 3)), [[0, 1, -1]]), r"outside 0\.\.3"),
     ],
 )
 def test_what_is_no_solid_is_refused(mesh, message):
     with pytest.raises(InputError, match=message):
         repaired(*mesh)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_vertices_that_are_not_finite_are_refused_and_counted(bad):
-    vertices = np.array(box().vertices)
-    vertices[5, 1] = bad
-    with pytest.raises(InputError, match=r"1 of 8 vertices are not finite .*vertex 5\)"):
-        repaired(vertices, box().faces)
-
-
-@pytest.mark.parametrize(
-    ("vertices", "faces", "message"),
-    [
-        (np.zeros((0, 3)), np.zeros((0, 3), int), "has no faces"),
-        (np.zeros((4, 3)), np.zeros((0, 3), int), "has no faces"),
-        (np.zeros((4, 2)), np.array([[0, 1, 2]]), r"vertices have shape \(4, 2\)"),
-        (np.zeros((4, 3)), np.array([[0, 1, 2, 3]]), r"faces have shape \(1, 4\)"),
-        (np.zeros((4, 3)), np.array([[0.0, 1, 2]]), "not integer"),
-        (np.zeros((4, 3)), np.array([[0, 1, 4]]), r"outside 0\.\.3"),
-        (np.zeros((4, 3)), np.array([[0, 1, -1]]), r"outside 0\.\.3"),
-    ],
-)
-def test_arrays_that_are_no_mesh_are_refused(vertices, faces, message):
-    with pytest.raises(InputError, match=message):
-        repair_solid(vertices, faces, name="part")
 
 
 def test_vertices_that_meet_by_the_thousand_are_not_paired_one_by_one(monkeypatch):

@@ -37,12 +37,10 @@ class Section(NamedTuple):
       contour_mm: [P, 2] f64, mm (axial, tangential), counter-clockwise from the suction side's
         trailing-edge tangency: suction side, leading edge, pressure side, trailing edge.
       normals: [P, 2] f64 unit, outward, of the exact curves.
-      exit_half_wedge_deg: the trailing edge's half wedge, which the throat decides.
     """
 
     contour_mm: np.ndarray
     normals: np.ndarray
-    exit_half_wedge_deg: float
 
     def offset(self, distance_mm: float) -> np.ndarray:
         """The contour [P, 2] in mm moved outward by ``distance_mm`` along its normals."""
@@ -159,7 +157,7 @@ class Airfoil:
         contour = np.concatenate([points[:-1] for points, _ in pieces])
         normals = np.concatenate([directions[:-1] for _, directions in pieces])
         require_simple(contour, str(self))
-        return Section(contour, normals, math.degrees(wedge))
+        return Section(contour, normals)
 
     def _throat_point(self, pitch_mm: float, throat_angle: float) -> np.ndarray:
         """[2] mm: where the passage is narrowest, seen from the neighbour's trailing edge."""

@@ -141,7 +141,7 @@ def _weld_open_edges(mesh: Triangles, notes: list[str]) -> Triangles:
     if not 0 < count <= max(MAX_PAIRS, 8 * len(rim)):
         return mesh
     pairs = tree.query_pairs(reach, output_type="ndarray")
-    _, cluster = connected(pairs, len(rim))
+    cluster = connected(pairs, len(rim))
     lowest = np.full(cluster.max() + 1, len(mesh.points))
     np.minimum.at(lowest, cluster, rim)
     target = np.arange(len(mesh.points))

@@ -7,7 +7,6 @@ import numpy as np
 import scipy.sparse.csgraph
 
 from vanejax.cad.triangles import (
-    Edges,
     Triangles,
     canonical,
     counted,
@@ -22,11 +21,11 @@ from vanejax.errors import InputError
 MAX_BODIES = 256
 
 
-def connected(pairs: np.ndarray, count: int) -> tuple[int, np.ndarray]:
-    """Connected components of an undirected graph: their number and a label per node."""
+def connected(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Connected components of an undirected graph: a label per node."""
     ones = np.ones(len(pairs), np.int8)
     graph = scipy.sparse.coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), (count, count))
-    return scipy.sparse.csgraph.connected_components(graph, directed=False)
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
 
 
 def wind_consistently(mesh: Triangles, name: str, notes: list[str]) -> tuple[Triangles, np.ndarray]:
@@ -38,14 +37,14 @@ def wind_consistently(mesh: Triangles, name: str, notes: list[str]) -> tuple[Tri
     """
     edges, count = mesh.edges, len(mesh.faces)
     paired = edges.order[np.repeat(edges.uses == 2, edges.uses)].reshape(-1, 2)
-    paired = np.concatenate([paired, *_wedges(mesh, edges)])
+    paired = np.concatenate([paired, *_wedges(mesh)])
     first, second = (paired // 3).T
     turned = edges.ends[paired[:, 0], 0] == edges.ends[paired[:, 1], 0]
     if not turned.any():  # then the two halves of the cover are alike and apart
-        return mesh, connected(np.stack([first, second], axis=1), count)[1]
+        return mesh, connected(np.stack([first, second], axis=1), count)
     other = second + np.where(turned, count, 0)
     cover = np.stack([np.r_[first, first + count], np.r_[other, (other + count) % (2 * count)]], 1)
-    _, label = connected(cover, 2 * count)
+    label = connected(cover, 2 * count)
     as_is, flipped = label[:count], label[count:]
     if np.any(as_is == flipped):
         raise InputError(
@@ -74,7 +73,7 @@ def _contains(body: Triangles, point: np.ndarray) -> bool:
     return abs(turns) > 0.75  # 0.5 is on the surface
 
 
-def _wedges(mesh: Triangles, edges: Edges) -> list[np.ndarray]:
+def _wedges(mesh: Triangles) -> list[np.ndarray]:
     """Pairs [P, 2] of edge rows that bound the same solid, where bodies touch along an edge.
 
     Seen along such an edge the solids are wedges. With the file's winding, going around in the
@@ -82,6 +81,7 @@ def _wedges(mesh: Triangles, edges: Edges) -> list[np.ndarray]:
     it upward: brackets, which match their partners. Of faces at the same angle (an inner wall),
     one wedge closes before the next opens.
     """
+    edges = mesh.edges
     first = np.concatenate([[0], np.cumsum(edges.uses)])
     pairs = []
     for group in np.flatnonzero((edges.uses > 2) & (edges.net == 0)):

@@ -37,12 +37,10 @@ def cyclic(order: int, axis: np.ndarray, point: np.ndarray = ORIGIN) -> np.ndarr
     return np.stack([rotation_about(axis, 360 * i / order, point) for i in range(order)])
 
 
-def dihedral(
-    order: int, axis: np.ndarray, flip: np.ndarray, point: np.ndarray = ORIGIN
-) -> np.ndarray:
-    """The group D_n [2n, 4, 4]: C_n about ``axis``, and half turns like that about ``flip``."""
-    turns = cyclic(order, axis, point)
-    return np.concatenate([turns, turns @ rotation_about(flip, 180, point)])
+def dihedral(order: int, axis: np.ndarray, flip: np.ndarray) -> np.ndarray:
+    """The group D_n [2n, 4, 4] about the origin: C_n, and half turns like that about ``flip``."""
+    turns = cyclic(order, axis)
+    return np.concatenate([turns, turns @ rotation_about(flip, 180, ORIGIN)])
 
 
 class DenseSurface:

@@ -36,14 +36,12 @@ class Face(NamedTuple):
       normal_covariance: [3, 3] rad^2, rank 2: the normal's error is square to it.
       offset_variance: mm^2, of the plane along its normal at the centre; not correlated with the
         normal's error there.
-      rms_mm: of the points from the plane.
     """
 
     normal: np.ndarray
     center: np.ndarray
     normal_covariance: np.ndarray
     offset_variance: float
-    rms_mm: float
 
     def height_mm(self, points: np.ndarray) -> np.ndarray:
         """[N] of points [N, 3] above the plane."""
@@ -79,7 +77,7 @@ class Cube(NamedTuple):
         for face in self.faces:
             tilt = turn @ face.normal_covariance @ turn.T
             center = turn @ face.center + shift
-            faces.append(Face(turn @ face.normal, center, tilt, *face[3:]))
+            faces.append(Face(turn @ face.normal, center, tilt, face.offset_variance))
         return Cube(tuple(faces))
 
 
@@ -119,7 +117,7 @@ def fit_face(points: np.ndarray, *, noise_mm: float = 0.0, form_mm: float = 0.0)
     own = rms * np.sqrt(count / (count - 3)) if count > 3.5 else 0.0
     each = max(own, noise_mm) ** 2 / count + form_mm**2 / min(count, FORM_PATCHES)
     tilts = axes[:, 1:] * np.sqrt(each * count / values[1:])
-    return Face(axes[:, 0], center, tilts @ tilts.T, each, rms)
+    return Face(axes[:, 0], center, tilts @ tilts.T, each)
 
 
 def cube_of(

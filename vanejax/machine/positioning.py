@@ -160,10 +160,8 @@ class MotionErrors(NamedTuple):
         self, before: np.ndarray, after: np.ndarray, calibration: np.ndarray | None = None
     ) -> np.ndarray:
         """[6, 6] of the motion, from independent covariances [6, 6]; None for a known frame."""
-        maps = [(self.of_before, before), (self.of_after, after)]
-        if calibration is not None:
-            maps.append((self.of_calibration, calibration))
-        return sum(way @ matrix @ way.T for way, matrix in maps)
+        pairs = zip(self[1:], (before, after, calibration), strict=True)
+        return sum(way @ matrix @ way.T for way, matrix in pairs if matrix is not None)
 
     def common(
         self, before: np.ndarray, after: np.ndarray, calibration: np.ndarray | None = None
@@ -173,8 +171,8 @@ class MotionErrors(NamedTuple):
         Each has a column in every argument. ``common @ common.T`` is a covariance if the columns
         are for one standard deviation of independent causes.
         """
-        total = self.of_before @ before + self.of_after @ after
-        return total if calibration is None else total + self.of_calibration @ calibration
+        pairs = zip(self[1:], (before, after, calibration), strict=True)
+        return sum(way @ columns for way, columns in pairs if columns is not None)
 
 
 def motion_errors(
