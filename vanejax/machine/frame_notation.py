@@ -54,8 +54,7 @@ def _writer(template: str, order: str, *, sign: str = "") -> Callable[[RigidTran
     return write
 
 
-# A turns about z, B about the y so turned, C about the x turned twice
-# (KUKA System Software, operating and programming instructions).
+# KUKA System Software, operating and programming instructions
 write_kuka = _writer("{{X {0},Y {1},Z {2},A {5},B {4},C {3}}}", "xyz")
 
 
@@ -68,12 +67,6 @@ def read_kuka(text: str) -> RigidTransform:
     words = [(name.upper(), value.strip()) for name, value in items]
     values = _values(words, "XYZABC", "the KUKA frame")
     return _frame(values, [values[name] for name in "ABC"])
-
-
-# G10 L2 P1 sets G54: the part's origin in the machine. G68.2 is a tilted working plane upon it,
-# here with the same origin: I turns about Z, J about the turned X, K about the Z turned twice
-# (Fanuc; post processors call it EULER_ZXZ_R).
-write_iso = _writer("G90 G10 L2 P1 X{} Y{} Z{}\nG54\nG68.2 X0. Y0. Z0. I{} J{} K{}", "ZXZ")
 
 
 def read_iso(text: str) -> RigidTransform:
@@ -123,16 +116,6 @@ def read_iso(text: str) -> RigidTransform:
     return offset if tilted is None else offset @ tilted
 
 
-# Upon a preset that is the machine's datum. SPA, SPB, SPC turn about the fixed X, then Y, then Z
-# (TNC 620, conversational programming, 10/2017, p. 540). STAY moves no axis.
-write_heidenhain = _writer(
-    "CYCL DEF 7.0 DATUM SHIFT\nCYCL DEF 7.1 X{}\nCYCL DEF 7.2 Y{}\nCYCL DEF 7.3 Z{}\n"
-    "PLANE SPATIAL SPA{} SPB{} SPC{} STAY",
-    "xyz",
-    sign="+",
-)
-
-
 def read_heidenhain(text: str) -> RigidTransform:
     """The frame of a datum shift and, if there is one, of PLANE SPATIAL after it."""
     text = re.sub(r";.*", "", text).upper()
@@ -146,11 +129,6 @@ def read_heidenhain(text: str) -> RigidTransform:
     words = re.findall(rf"SP([A-Z])\s*({_NUMBER})(?![\d.])", planes[0])
     angles = _values(words, "ABC", "PLANE SPATIAL, SP")
     return _frame(values, [angles[name] for name in "CBA"])
-
-
-# The settable frame of G54. CROT turns by RPY angles: Z, then the turned Y, then the X turned twice
-# (MD10600 = 1, the default; SINUMERIK 840D sl, Basic Functions, K2, 11/2006, p. 56).
-write_siemens = _writer("$P_UIFR[1]=CTRANS(X,{},Y,{},Z,{}):CROT(X,{},Y,{},Z,{})", "xyz")
 
 
 def read_siemens(text: str) -> RigidTransform:
@@ -188,19 +166,27 @@ NOTATIONS: Mapping[str, Notation] = {
     "iso": Notation(
         "ISO G-code (Fanuc)",
         "mm, deg; G68.2 is upon G54, R = Rz(I) Rx(J) Rz(K): about Z, X', Z''",
-        write_iso,
+        # a tilted working plane with the origin of G54; post processors call it EULER_ZXZ_R
+        _writer("G90 G10 L2 P1 X{} Y{} Z{}\nG54\nG68.2 X0. Y0. Z0. I{} J{} K{}", "ZXZ"),
         read_iso,
     ),
     "heidenhain": Notation(
         "Heidenhain",
         "mm, deg; upon a preset at the machine's datum, R = Rz(SPC) Ry(SPB) Rx(SPA)",
-        write_heidenhain,
+        # TNC 620, conversational programming, 10/2017, p. 540; STAY moves no axis
+        _writer(
+            "CYCL DEF 7.0 DATUM SHIFT\nCYCL DEF 7.1 X{}\nCYCL DEF 7.2 Y{}\nCYCL DEF 7.3 Z{}\n"
+            "PLANE SPATIAL SPA{} SPB{} SPC{} STAY",
+            "xyz",
+            sign="+",
+        ),
         read_heidenhain,
     ),
     "siemens": Notation(
         "Siemens frame of G54",
         "mm, deg; CROT by RPY: R = Rz(Z) Ry(Y) Rx(X)",
-        write_siemens,
+        # MD10600 = 1, the default; SINUMERIK 840D sl, Basic Functions, K2, 11/2006, p. 56
+        _writer("$P_UIFR[1]=CTRANS(X,{},Y,{},Z,{}):CROT(X,{},Y,{},Z,{})", "xyz"),
         read_siemens,
     ),
 }
