@@ -49,19 +49,16 @@ def check(found):
 def test_a_scan(tmp_path, view):
     save_points(tmp_path / "vane.ply", view.points, view.normals)
     found = check(inspect(tmp_path / "vane.ply"))
-    assert found.kind == "point cloud"
-    assert found.format == "PLY, binary little endian"
+    assert (found.kind, found.format) == ("point cloud", "PLY, binary little endian")
     assert found.size_bytes == (tmp_path / "vane.ply").stat().st_size
     assert found.points == len(view.points)
     np.testing.assert_allclose(found.extent, np.ptp(view.points, axis=0), rtol=1e-6)  # f32
-    assert found.units == "mm"
-    assert (found.missing, found.repeated) == (0, 0)
+    assert (found.units, found.missing, found.repeated) == ("mm", 0, 0)
     # at 400 mm a pixel is 0.24 x 0.18 mm wide; slanted faces are wider
     assert 0.18 < found.spacing < 0.21
     assert found.normals == "present, 100 % of them towards the origin"
     assert found.sensor == "can have stood at the origin, looking along -z"
-    assert found.sensor_origin == (0.0, 0.0, 0.0)
-    assert found.looks_along == "-z"
+    assert (found.sensor_origin, found.looks_along) == ((0.0, 0.0, 0.0), "-z")
     assert found.faces is found.watertight is found.volume_mm3 is None
     assert found.next_steps == (f"vanejax register {tmp_path / 'vane.ply'} PART.stl",)
     assert "points   " + f"{len(view.points):,}" in found.text()
@@ -123,10 +120,8 @@ def test_a_cad_file(tmp_path, vane, suffix):
     path = tmp_path / f"vane{suffix}"
     vane.export(path)
     found = check(inspect(path))
-    assert found.kind == "mesh"
-    assert found.faces == len(vane.mesh.faces)
-    assert found.watertight
-    assert found.bodies == 1
+    assert (found.kind, found.faces) == ("mesh", len(vane.mesh.faces))
+    assert (found.watertight, found.bodies) == (True, 1)
     # OBJ rounds to eight decimals, GLB to float32
     np.testing.assert_allclose(found.volume_mm3, vane.mesh.volume, rtol=1e-5)
     unit = "m" if suffix == ".glb" else "mm"
@@ -143,11 +138,9 @@ def test_a_cad_file(tmp_path, vane, suffix):
 
 def test_meshes_with_faults(tmp_path):
     box = trimesh.creation.box((30, 40, 50))
-    open_box = trimesh.Trimesh(box.vertices, box.faces[2:])
-    open_box.export(tmp_path / "open.ply")
+    trimesh.Trimesh(box.vertices, box.faces[2:]).export(tmp_path / "open.ply")
     found = check(inspect(tmp_path / "open.ply"))
-    assert found.watertight is False
-    assert found.volume_mm3 is None
+    assert (found.watertight, found.volume_mm3) == (False, None)
     assert found.notes[-1].startswith("cannot serve as a part: open.ply")
     assert found.next_steps[0].startswith("vanejax register ")
     assert found.next_steps[0].endswith("PART.stl   # if this is a scan")
@@ -156,11 +149,9 @@ def test_meshes_with_faults(tmp_path):
     found = check(inspect(tmp_path / "two.stl"))
     assert (found.watertight, found.bodies) == (True, 2)
     assert found.volume_mm3 == pytest.approx(120_000)
-    bad = box.copy()
-    vertices = np.array(bad.vertices)
+    vertices = np.array(box.vertices)
     vertices[0] = np.nan
-    data = trimesh.Trimesh(vertices, bad.faces, process=False).export(file_type="stl")
-    (tmp_path / "nan.stl").write_bytes(data)
+    trimesh.Trimesh(vertices, box.faces, process=False).export(tmp_path / "nan.stl")
     found = check(inspect(tmp_path / "nan.stl"))
     assert found.watertight is None
     assert "not finite" in found.notes[-1]
@@ -217,20 +208,18 @@ def test_any_other_file(tmp_path, name, data, written):
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        inspect(tmp_path / "a.ply")
     with pytest.raises(InputError, match="is a folder"):
         inspect(tmp_path)
-    for name in ("a.ply", "a.stl", "a.npz", "a.json"):
-        (tmp_path / name).write_bytes(b"")
-        with pytest.raises(InputError, match="is empty"):
+    for name, data, words in (
+        ("a.ply", None, "no such file"),
+        *((name, b"", "is empty") for name in ("a.ply", "a.stl", "a.npz", "a.json")),
+        ("a.npz", b"PK\x03\x04 and nothing", "damaged"),
+        ("a.stl", b"solid a\n", "without triangles"),
+    ):
+        if data is not None:
+            (tmp_path / name).write_bytes(data)
+        with pytest.raises(InputError, match=words):
             inspect(tmp_path / name)
-    (tmp_path / "a.npz").write_bytes(b"PK\x03\x04 and nothing")
-    with pytest.raises(InputError, match="damaged"):
-        inspect(tmp_path / "a.npz")
-    (tmp_path / "a.stl").write_bytes(b"solid a\n")
-    with pytest.raises(InputError, match="without triangles"):
-        inspect(tmp_path / "a.stl")
 
 
 def test_the_spacing_of_a_large_cloud_is_that_of_the_whole(tmp_path, monkeypatch):
