@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from vanejax.pointcloud import PointCloud, ball_query, squared_distances, voxel_thin
+from vanejax.pointcloud import PointCloud, ball_query, squared_distances
 from vanejax.rigid import RigidTransform
+from vanejax.scans.voxels import voxel_thin
 
 query = jax.jit(ball_query, static_argnames=("radius", "num_neighbors"))
 

@@ -1,11 +1,10 @@
-"""Point clouds with a fixed number of rows: padding, neighbours, thinning."""
+"""Point clouds with a fixed number of rows: padding and neighbours."""
 
 from __future__ import annotations
 
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from vanejax.rigid import RigidTransform
 
@@ -109,30 +108,3 @@ def ball_query(xyz: jax.Array, mask: jax.Array, *, radius: float, num_neighbors:
     wanted = jnp.arange(1, num_neighbors + 1, dtype=jnp.int32)
     found = jax.vmap(lambda row: jnp.searchsorted(row, wanted))(running)
     return jnp.where(found < xyz.shape[0], found.astype(jnp.int32), itself[:, None])
-
-
-def voxel_thin(points: np.ndarray, *, voxel_mm: float) -> np.ndarray:
-    """Indices of one point per occupied voxel: the one nearest to the voxel's mean point.
-
-    Args:
-      points: [N, 3], mm, on the host.
-      voxel_mm: edge length of the cubic grid, anchored at the origin of the points' frame.
-
-    Returns:
-      indices [n] i64, ascending; real points are kept, so normals and face ids still belong.
-    """
-    points = np.asarray(points, np.float64)
-    if len(points) == 0:
-        return np.zeros(0, np.int64)
-    cells = np.floor(points / voxel_mm).astype(np.int64)
-    cells -= cells.min(axis=0)
-    spans = cells.max(axis=0) + 1
-    flat = (cells[:, 0] * spans[1] + cells[:, 1]) * spans[2] + cells[:, 2]
-    _, cell_of, counts = np.unique(flat, return_inverse=True, return_counts=True)
-    means = np.stack(
-        [np.bincount(cell_of, weights=points[:, k]) / counts for k in range(3)], axis=1
-    )
-    squared = np.sum((points - means[cell_of]) ** 2, axis=1)
-    order = np.lexsort((squared, cell_of))
-    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    return np.sort(order[first])

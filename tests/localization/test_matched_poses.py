@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 from vanejax.localization import matched_poses
 from vanejax.localization.matched_poses import icosahedral_rotations, match_poses
 from vanejax.matching.rpmnet import RpmNet
-from vanejax.pointcloud import PointCloud, voxel_thin
+from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera
 from vanejax.scans.measured_scan import clean_scan
+from vanejax.scans.voxels import voxel_thin
 from vanejax.training import PairSampling, TrainedMatcher
 
 MODEL = RpmNet(num_neighbors=8, radius=0.5, sinkhorn_iterations=2, feature_width=8)

@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 from vanejax.localization.fine_registration import subset
 from vanejax.matching.fast_rpmnet import features, last_match, neighborhoods
 from vanejax.matching.rpmnet import RpmNet
-from vanejax.pointcloud import PointCloud, voxel_thin
+from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.scans.measured_scan import MeasuredScan
 from vanejax.scans.normals import estimate_normals
+from vanejax.scans.voxels import voxel_thin
 from vanejax.training.weight_file import TrainedMatcher
 
 # Hypotheses that are vmapped together. A CPU gains nothing from it (measured: 0.83 s for 60 one by

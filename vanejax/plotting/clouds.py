@@ -27,8 +27,8 @@ from vanejax.plotting.canvas import (
     name_panel,
     new_figure,
 )
-from vanejax.pointcloud import voxel_thin
 from vanejax.scanner import Scan, look_at
+from vanejax.scans.voxels import voxel_thin
 
 # Where the reader stands, as a viewpoint of the hemisphere: oblique enough to see a tilt.
 READER_ELEVATION_DEG = 50.0

@@ -12,6 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import trimesh
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 from scipy.spatial import cKDTree
@@ -22,6 +23,7 @@ from vanejax.plotting.canvas import DEVIATION_COLORMAP, NO_PARTNER, SCAN
 from vanejax.plotting.deviation import color_limit_mm, overlay_rotation
 from vanejax.rigid import RigidTransform
 from vanejax.scans import MeasuredScan
+from vanejax.scans.voxels import Voxels
 
 MAX_VERTICES = 65_535
 MAX_POINTS = 60_000
@@ -171,29 +173,16 @@ def simplified(
     if len(vertices) <= max_vertices:
         return vertices, faces, 0.0
     low = vertices.min(axis=0)
-    corners = vertices[faces]
-    area = 0.5 * np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
     # a plane at any angle crosses about 1.5 cells per cell's area
-    side = float(np.sqrt(1.5 * area.sum() / max_vertices))
-    while True:
-        cell = np.floor((vertices - low) / side).astype(np.int64)
-        size = cell.max(axis=0) + 1
-        flat = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
-        _, cluster, count = np.unique(flat, return_inverse=True, return_counts=True)
-        if len(count) <= max_vertices:
-            break
+    side = float(np.sqrt(1.5 * trimesh.triangles.area(vertices[faces]).sum() / max_vertices))
+    while len(cells := Voxels(vertices - low, side)) > max_vertices:
         side *= 1.15
-    means = np.stack(
-        [np.bincount(cluster, weights=vertices[:, axis]) / count for axis in range(3)], axis=1
-    )
-    merged = cluster[faces]
+    merged = cells.of_point[faces]
     a, b, c = merged.T
     merged = merged[(a != b) & (b != c) & (c != a)]
     # of several faces with the same corners one is enough, from whichever side it is seen
     _, first = np.unique(np.sort(merged, axis=1), axis=0, return_index=True)
-    return means, merged[first], side
+    return cells.middle + low, merged[first], side
 
 
 def to_grid(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Points in cubes: what hangs together, and where a surface folds inwards."""
+"""Points in cubes: one of each, what hangs together, and where a surface folds inwards."""
 
 from __future__ import annotations
 
@@ -102,3 +102,23 @@ class Voxels:
         normals = np.linalg.eigh(spread)[1][:, :, 0]
         side = np.einsum("vi,vi->v", normals, sensor_origin - self.middle)
         return np.where(side[:, None] < 0, -normals, normals)
+
+
+def voxel_thin(points: np.ndarray, *, voxel_mm: float) -> np.ndarray:
+    """Indices of one point per occupied voxel: the one nearest to the voxel's mean point.
+
+    Args:
+      points: [N, 3], mm, on the host.
+      voxel_mm: edge length of the cubic grid, anchored at the origin of the points' frame.
+
+    Returns:
+      indices [n] i64, ascending; real points are kept, so normals and face ids still belong.
+    """
+    points = np.asarray(points, np.float64)
+    if len(points) == 0:
+        return np.zeros(0, np.int64)
+    voxels = Voxels(points, voxel_mm)
+    squared = np.sum((points - voxels.middle[voxels.of_point]) ** 2, axis=1)
+    order = np.lexsort((squared, voxels.of_point))
+    first = np.unique(voxels.of_point[order], return_index=True)[1]
+    return np.sort(order[first])

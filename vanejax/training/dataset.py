@@ -13,9 +13,9 @@ import numpy as np
 from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.files import read_versioned_arrays, write_arrays
-from vanejax.pointcloud import voxel_thin
 from vanejax.rigid import RigidTransform
 from vanejax.scanner import Camera, Scan, Viewpoints, scan_views
+from vanejax.scans.voxels import voxel_thin
 
 FORMAT = "vanejax scan set"
 VERSION = 1

@@ -18,10 +18,11 @@ import numpy as np
 
 from vanejax.cad import InvestmentCasting, Part, as_cast
 from vanejax.errors import InputError
-from vanejax.pointcloud import PointCloud, voxel_thin
+from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
 from vanejax.scanner import Scanner, Sensor, look_at, measure, preset
 from vanejax.scans.normals import estimate_normals
+from vanejax.scans.voxels import voxel_thin
 from vanejax.settings import Settings, bounded, not_negative, positive, settings_class, share
 from vanejax.training.dataset import ScanSet, padded
 from vanejax.training.pairs import PairSampling, ScanBank, make_bank

@@ -35,9 +35,9 @@ from vanejax.localization import measurement_model, refine, register
 from vanejax.localization.matched_poses import match_poses
 from vanejax.localization.pose_batch import select, stack
 from vanejax.plotting import save_figure
-from vanejax.pointcloud import voxel_thin
 from vanejax.rigid import RigidTransform
 from vanejax.scans import MeasuredScan
+from vanejax.scans.voxels import voxel_thin
 from vanejax.training import TrainedMatcher, find_weights
 from vanejax.training.online_scans import RandomViews
 
