@@ -193,7 +193,7 @@ def torch_step(bench: Bench, pairs: VanePairs) -> tuple[list[float], str]:
     batch = [pairs.pair(seed) for seed in range(pairs.batch)]
     tensors = [torch.tensor(np.stack(arrays)) for arrays in zip(*map(_arrays, batch), strict=True)]
     iterations = pairs.config.loss.iterations
-    step = torch_rpmnet.make_train_step(model, iterations=iterations)
+    step = torch_rpmnet.make_train_step(model, iterations)
     seconds, loss = bench.time(lambda: step(*tensors))
     note = f"a reference for each pair, {torch.get_num_threads()} threads, loss {loss:.3f}"
     return seconds, note

@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 
 from experiments.benchmarks.network import VanePairs, registering, training
-from experiments.benchmarks.timing import NOISE_MM, Bench, shown
+from experiments.benchmarks.timing import NOISE_MM, Bench, spread_cells
 from experiments.runner import study_command as study
 from experiments.runner.vane_views import VaneViews, with_noise
 from vanejax.cad import Part, load_part
@@ -67,16 +67,16 @@ def scaling(bench: Bench, sizes: Sizes | None = None) -> Iterator[Series]:
 
 
 def over(
+    bench: Bench,
     unit: str,
     sizes: Sequence[float],
     runs_of: Callable[[Any], Mapping[str, Callable[[], Any]]],
-    time: Callable[[Callable[[], Any]], list[float]],
 ) -> Iterator[Series]:
     """A series for each of the runs that there are of every size."""
     seconds: dict[str, list[list[float]]] = {}
     for size in sizes:
         for name, run in runs_of(size).items():
-            seconds.setdefault(name, []).append(time(run))
+            seconds.setdefault(name, []).append(bench.time_sparingly(run))
     for name, times in seconds.items():
         yield Series(name, unit, sizes, times)
 
@@ -100,7 +100,7 @@ def over_faces(bench: Bench, edge_pieces: tuple[int, ...]) -> Iterator[Series]:
                 ),
             }
 
-        yield from over("faces", list(pieces_of), runs_of, bench.time_sparingly)
+        yield from over(bench, "faces", list(pieces_of), runs_of)
 
 
 def refined(part: Part, pieces: int) -> Part:
@@ -147,7 +147,7 @@ def over_points(bench: Bench, counts: tuple[int, ...]) -> Iterator[Series]:
                 ),
             }
 
-        yield from over("points", counts, runs_of, bench.time_sparingly)
+        yield from over(bench, "points", counts, runs_of)
 
 
 def measured_points(bench: Bench, count: int) -> np.ndarray:
@@ -162,23 +162,27 @@ def measured_points(bench: Bench, count: int) -> np.ndarray:
 
 def over_network(bench: Bench, sizes: Sizes) -> Iterator[Series]:
     """RPM-Net of more and more points, neighbours and pairs; the first run of each compiles."""
-
-    def time(run: Callable[[], Any]) -> list[float]:
-        return bench.time(run)[0]
-
-    def points(size: int) -> dict[str, Callable[[], Any]]:
-        pairs = VanePairs(sources=size, targets=size)
-        return {"inference, points of each cloud": registering(pairs)}
-
-    def neighbors(size: int) -> dict[str, Callable[[], Any]]:
-        return {"inference, neighbours": registering(VanePairs(neighbors=size))}
-
-    def batches(size: int) -> dict[str, Callable[[], Any]]:
-        return {"training step, pairs of a batch": training(VanePairs(batch=size))}
-
-    yield from over("points", sizes.network_points, points, time)
-    yield from over("neighbours", sizes.neighbors, neighbors, time)
-    yield from over("pairs", sizes.batches, batches, time)
+    for name, unit, values, run_of in (
+        (
+            "inference, points of each cloud",
+            "points",
+            sizes.network_points,
+            lambda size: registering(VanePairs(sources=size, targets=size)),
+        ),
+        (
+            "inference, neighbours",
+            "neighbours",
+            sizes.neighbors,
+            lambda size: registering(VanePairs(neighbors=size)),
+        ),
+        (
+            "training step, pairs of a batch",
+            "pairs",
+            sizes.batches,
+            lambda size: training(VanePairs(batch=size)),
+        ),
+    ):
+        yield Series(name, unit, values, [bench.time(run_of(size))[0] for size in values])
 
 
 def exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float | None:
@@ -209,7 +213,6 @@ def scaling_table(rows: Sequence[dict[str, Any]]) -> str:
         power = "" if row["exponent"] is None else f": grows as size^{row['exponent']:.2f}"
         lines.append(f"{row['name']}{power}")
         for point in row["points"]:
-            median, least, most = (shown(point["seconds"][k]) for k in ("median", "min", "max"))
             size = f"{point['size']:,.0f} {row['unit']}"
-            lines.append(f"{size:>46}{median:>11}{f'{least} - {most}':>20}")
+            lines.append(f"{size:>46}{spread_cells(point['seconds'])}")
     return "\n".join(lines)

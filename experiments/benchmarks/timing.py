@@ -181,10 +181,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     """The rows as aligned text, at most 100 columns wide but for long notes."""
     lines = [f"{'':<46}{'median (s)':>11}{'min - max':>20}  goal (s)"]
     for row in rows:
-        cells = f"{'-':>11}{'':>20}"
-        if row["seconds"]:
-            median, least, most = (shown(row["seconds"][k]) for k in ("median", "min", "max"))
-            cells = f"{median:>11}{f'{least} - {most}':>20}"
+        cells = spread_cells(row["seconds"]) if row["seconds"] else f"{'-':>11}{'':>20}"
         goal = ""
         if row["goal_s"] is not None:
             goal = f"  {row['goal_s']:g}" + (f": {row['met']}" if row["met"] else "")
@@ -204,6 +201,12 @@ def comparison(entry: Mapping[str, Any]) -> str:
     if entry["met"] is None:
         return words
     return f"{words} ({'at least' if peer else 'at most'} {entry['goal']:g}: {entry['met']})"
+
+
+def spread_cells(seconds: Mapping[str, float]) -> str:
+    """The columns of a median and its range."""
+    median, least, most = (shown(seconds[key]) for key in ("median", "min", "max"))
+    return f"{median:>11}{f'{least} - {most}':>20}"
 
 
 def shown(seconds: float) -> str:

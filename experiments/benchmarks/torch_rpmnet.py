@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 _EPSILON = 1e-5
+SINKHORN_ITERATIONS, LEARNING_RATE = 5, 1e-4
 
 
 def square_distance(a: Tensor, b: Tensor) -> Tensor:
@@ -98,10 +99,10 @@ class ParameterNet(nn.Module):
         return functional.softplus(self.postpool(x))
 
 
-def log_sinkhorn(affinity: Tensor, iterations: int) -> Tensor:
+def log_sinkhorn(affinity: Tensor) -> Tensor:
     """Log assignments [B, N, M] with a slack row and column that are never normalised."""
     x = functional.pad(affinity, (0, 1, 0, 1))
-    for _ in range(iterations):
+    for _ in range(SINKHORN_ITERATIONS):
         rows = x[:, :-1] - torch.logsumexp(x[:, :-1], dim=2, keepdim=True)
         x = torch.cat([rows, x[:, -1:]], dim=1)
         columns = x[:, :, :-1] - torch.logsumexp(x[:, :, :-1], dim=1, keepdim=True)
@@ -133,11 +134,8 @@ def move(motion: Tensor, cloud: Tensor) -> Tensor:
 class TorchRpmNet(nn.Module):
     """RPM-Net on batches of pairs; `load_state_dict` takes the published weights by name."""
 
-    def __init__(
-        self, *, num_neighbors: int = 32, radius: float = 0.3, sinkhorn_iterations: int = 5
-    ) -> None:
+    def __init__(self, *, num_neighbors: int = 32, radius: float = 0.3) -> None:
         super().__init__()
-        self.sinkhorn_iterations = sinkhorn_iterations
         self.weights_net = ParameterNet()
         self.feat_extractor = FeatureNet(radius, num_neighbors)
 
@@ -151,7 +149,7 @@ class TorchRpmNet(nn.Module):
             beta, alpha = parameters[..., None, None].unbind(1)
             features = self.feat_extractor(moved), self.feat_extractor(target)
             affinity = -beta * (square_distance(*features) - alpha)
-            assignment = log_sinkhorn(affinity, self.sinkhorn_iterations).exp()
+            assignment = log_sinkhorn(affinity).exp()
             weights = assignment.sum(2)
             partners = assignment @ target[..., :3] / (weights[..., None] + _EPSILON)
             motions.append(weighted_procrustes(source[..., :3], partners, weights))
@@ -174,10 +172,10 @@ def loss(
 
 
 def make_train_step(
-    model: TorchRpmNet, *, iterations: int, learning_rate: float = 1e-4
+    model: TorchRpmNet, iterations: int
 ) -> Callable[[Tensor, Tensor, Tensor], float]:
     """A step of Adam on source, target and true motion; gives the loss."""
-    optimizer = torch.optim.Adam(model.parameters(), lr=learning_rate)
+    optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
 
     def step(source: Tensor, target: Tensor, truth: Tensor) -> float:
         optimizer.zero_grad()

@@ -77,7 +77,7 @@ def test_a_step_has_the_loss_and_gradient_of_vanejax(peer, variables, clouds) ->
     truth = RigidTransform(exp_so3(np.float32([0.0, 0.1, 0.0])), np.float32([0.0, 0.0, 0.1]))
     matrix = np.asarray(truth.as_matrix())[:3]
     stepped = copy.deepcopy(peer)
-    step = torch_rpmnet.make_train_step(stepped, iterations=2)
+    step = torch_rpmnet.make_train_step(stepped, 2)
     loss = step(*(torch.tensor(c[None]) for c in (source, target, matrix)))
     batch = jax.tree.map(lambda leaf: leaf[None], (cloud(source), truth))
     pairs = Pair(source=batch[0], target=cloud(target), target_from_source=batch[1])

@@ -8,6 +8,8 @@ import re
 import pytest
 
 from experiments import performance_page, results_page
+from experiments.benchmarks.scaling import Series, summarize_scaling
+from experiments.benchmarks.timing import Figure, summarize
 from experiments.pages import blocks, tables
 from experiments.pages.blocks import page, pages
 from experiments.pages.reproduction.studies import RESULTS, recorded
@@ -79,41 +81,27 @@ def test_the_tables_follow_the_records() -> None:
     assert made == "Record `x.json`: A processor, 2 cores; 2026-01-02, commit 0123456789."
 
 
-def time_of(name: str, seconds: float, *, goal_s=None, met=None, against=()) -> dict:
-    spread = {"median": seconds, "min": seconds / 2, "max": 2 * seconds}
-    return {"name": name, "seconds": spread, "repeats": 5, "goal_s": goal_s, "met": met,
-            "against": against, "note": ""}  # fmt: skip
-
-
 def test_times_have_their_peers_limits_and_goals() -> None:
-    against = [
-        {"name": "a peer", "kind": "peer", "ratio": 6.2, "goal": 6, "met": "met"},
-        {"name": "a limit", "kind": "limit", "ratio": 2.0, "goal": None, "met": None},
-        {"name": "another", "kind": "peer", "ratio": None, "goal": 1, "met": None},
+    figures = [
+        Figure("a limit", [0.025, 0.05, 0.1]),
+        Figure("a thing", [0.1], {"a peer": 6.0, "another": 1.0}, {"a limit": None}, goal_s=0.05),
+        Figure("a peer", [0.62]),
+        Figure("another", [], note="skipped: missing"),
     ]
-    skipped = time_of("a peer", 0.0) | {"seconds": None, "repeats": 0, "note": "skipped: missing"}
-    mine = time_of("a thing", 0.1, goal_s=0.05, met="missed", against=against)
     report = {
         "machine": {"matmul_flops_per_second": 2.04e11},
-        "rows": [time_of("a limit", 0.05), mine, skipped],
-        "scaling": [
-            {
-                "name": "cost",
-                "unit": "points",
-                "exponent": 1.04,
-                "points": [{"size": n, "seconds": {"median": n / 1e4}} for n in (1000, 20000)],
-            }
-        ],
+        "rows": summarize(figures),
+        "scaling": summarize_scaling([Series("cost", "points", [1000, 20000], [[0.1], [2.0]])]),
     }
     lines = (tables.benchmark_table(report) + "\n" + tables.scaling_table(report)).splitlines()
-    assert lines[0] == "Medians of at least 5 repeats; 204 GFLOP/s in a large f32 product."
+    assert lines[0] == "Medians of at least 1 repeats; 204 GFLOP/s in a large f32 product."
     assert "| a limit | 0.0500 | 0.0250 to 0.100 |  |  |" in lines
     assert (
-        "| a thing | 0.100 | 0.0500 to 0.200 | 0.05 s: missed | 6.20 times as fast as a peer "
-        "(at least 6: met); 2.00 times as long as a limit; not compared with another |"
+        "| a thing | 0.100 | 0.100 to 0.100 | 0.05 s: missed | 6.20 times as fast as a peer "
+        "(at least 6: met); not compared with another; 2.00 times as long as a limit |"
     ) in lines
-    assert "| a peer |  |  |  | skipped: missing |" in lines
-    assert "| cost | 1,000, 20,000 points | 0.100, 2.000 | 1.04 |" in lines
+    assert "| another |  |  |  | skipped: missing |" in lines
+    assert "| cost | 1,000, 20,000 points | 0.100, 2.000 | 1.00 |" in lines
 
 
 def sentences() -> list[tuple[str, str]]:
