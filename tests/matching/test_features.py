@@ -1,4 +1,4 @@
-"""Point-pair features: exact at the point itself, unchanged by rigid motions, smooth."""
+"""Point-pair features: exact at the point itself, and smooth; `test_rpmnet` has their twin."""
 
 from __future__ import annotations
 
@@ -51,22 +51,6 @@ def test_the_point_itself_has_exactly_zero_features():
         found = np.array(point_pair_features(offset, normals, own))
         found[..., 2][np.abs(found[..., 2]) < 2e-7] = 0  # n x n by fused multiply-add: f32 eps
         np.testing.assert_array_equal(found, 0)
-
-
-def test_features_are_drost_s():
-    offset, normal, other = neighborhoods()
-    found = point_pair_features(*(x.astype(np.float32) for x in (offset, normal, other)))
-    assert found.shape == (9, 4, 4)
-    for i in range(9):
-        for k in range(4):
-            d = unit(offset[i, k])
-            expected = [
-                np.arccos(normal[i] @ d),
-                np.arccos(other[i, k] @ d),
-                np.arccos(normal[i] @ other[i, k]),
-                np.linalg.norm(offset[i, k]),
-            ]
-            np.testing.assert_allclose(found[i, k], expected, atol=2e-6)  # f32 eps x 10
 
 
 def test_gradients_are_right_and_finite_where_there_is_no_angle():
