@@ -52,6 +52,11 @@ def factor(default: float) -> Any:
     return bounded(default, _at_least_zero, "be >= 0", **{_FACTOR: True})
 
 
+def magnitude(default: float) -> Any:
+    """A finite number of at least 0, of an effect that 0 switches off."""
+    return bounded(default, _at_least_zero, "be 0 or more")
+
+
 def share(default: float) -> Any:
     """A number above 0, at most 1."""
     return bounded(default, lambda value: 0 < value <= 1, "lie in (0, 1]")
@@ -130,15 +135,25 @@ class Settings:
         factors = []
         for field in dataclasses.fields(self):  # pyright: ignore[reportArgumentType]
             value, place = getattr(self, field.name), f"{path}.{field.name}".lstrip(".")
-            bound: Bound | None = field.metadata.get(_BOUND)
-            if bound is not None and not _allowed(bound, value):
-                raise InputError(f"{place}={value!r} must {bound.words}")
+            _check_field(field, value, place)
             if isinstance(value, Settings):
                 value.check(place)
             if field.metadata.get(_FACTOR):
                 factors.append(field.name)
         if factors and not any(getattr(self, name) for name in factors):
             raise InputError(f"{path}: {', '.join(factors)} are all 0: nothing to learn")
+
+
+def check_fields(settings: Any, owner: str) -> None:
+    """Refuses, by InputError, a value of any dataclass that the field's `Bound` does not allow."""
+    for field in dataclasses.fields(settings):
+        _check_field(field, getattr(settings, field.name), f"{owner}: {field.name}")
+
+
+def _check_field(field: dataclasses.Field, value: Any, place: str) -> None:
+    bound: Bound | None = field.metadata.get(_BOUND)
+    if bound is not None and not _allowed(bound, value):
+        raise InputError(f"{place}={value!r} must {bound.words}")
 
 
 def _allowed(bound: Bound, value: Any) -> bool:

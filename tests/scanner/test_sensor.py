@@ -14,6 +14,7 @@ from vanejax.cad import guide_vane
 from vanejax.errors import InputError
 from vanejax.scanner import (
     Camera,
+    Clutter,
     Measurement,
     Reason,
     Scanner,
@@ -280,23 +281,37 @@ def test_fewer_pixels_leave_the_errors_in_mm(plate):
             assert mine == pytest.approx(theirs), name
 
 
+CANNOT_BE = {
+    Sensor: {
+        "baseline_mm": 0.0,
+        "max_incidence_deg": 91.0,
+        "noise_px": -1.0,
+        "edge_fattening_px": np.nan,
+        "incidence_spread_deg": -1.0,
+        "correlation_px": 0.5,
+        "flying_pixel_rate": 1.5,
+        "outlier_rate": np.nan,
+        "depth_quantisation_mm": np.inf,
+    },
+    Exposure: {
+        "exposure_ms": 0.0,
+        "projector_per_ms": np.nan,
+        "roughness": -1.0,
+        "ambient_per_ms": -0.1,
+        "specular": 1.5,
+        "ambient_towards": (0.0, 0.0, 0.0),
+        "least_modulation": np.inf,
+    },
+    Clutter: {"clamps": -1, "chips": -1, "drops": -1, "tilt_deg": np.nan},
+}
+
+
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("baseline_mm", 0.0),
-        ("max_incidence_deg", 91.0),
-        ("noise_px", -1.0),
-        ("edge_fattening_px", float("nan")),
-        ("incidence_spread_deg", -1.0),
-        ("correlation_px", 0.5),
-        ("flying_pixel_rate", 1.5),
-        ("outlier_rate", float("nan")),
-        ("depth_quantisation_mm", float("inf")),
-    ],
+    ("settings", "name"), [(kind, name) for kind, values in CANNOT_BE.items() for name in values]
 )
-def test_a_sensor_that_cannot_be_is_refused(name, value):
-    with pytest.raises(InputError, match=name):
-        dataclasses.replace(Sensor(), **{name: value})
+def test_what_cannot_be_is_refused(settings, name):
+    with pytest.raises(InputError, match=f"{settings.__name__.lower()}: {name}=.* must"):
+        settings(**{name: CANNOT_BE[settings][name]})
 
 
 def test_an_unknown_preset_is_answered_with_the_known_ones():

@@ -19,6 +19,7 @@ from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.scanner.ideal_scan import Hits
 from vanejax.scanner.virtual_scanner import Scanner
+from vanejax.settings import check_fields, magnitude
 
 _TABLE_MM = (600.0, 600.0, 20.0)
 _AROUND = 0.25  # of the part's extent: how far from it chips and drops may fall
@@ -83,15 +84,13 @@ class Clutter:
     """
 
     table: bool = False
-    tilt_deg: float = 0.0
-    clamps: int = 0
-    chips: int = 0
-    drops: int = 0
+    tilt_deg: float = magnitude(0.0)
+    clamps: int = magnitude(0)
+    chips: int = magnitude(0)
+    drops: int = magnitude(0)
 
     def __post_init__(self) -> None:
-        for name in ("tilt_deg", "clamps", "chips", "drops"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"clutter: {name}={getattr(self, name)!r} must be 0 or more")
+        check_fields(self, "clutter")
 
 
 def clutter_scene(part: Part, clutter: Clutter, rng: np.random.Generator) -> ClutterScene:

@@ -12,11 +12,10 @@ relative to a matte surface that faces the light, 400 mm away from it.
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 
-from vanejax.errors import InputError
+from vanejax.settings import bounded, check_fields, magnitude, positive
 
 REFERENCE_MM = 400.0
 # flatter than 89.4 deg: brightness would grow without limit
@@ -42,29 +41,21 @@ class Exposure:
     A value that no light can have raises InputError.
     """
 
-    exposure_ms: float = 10.0
-    projector_per_ms: float = 0.04
-    ambient_per_ms: float = 0.002
-    ambient_towards: tuple[float, float, float] = (-0.5, 0.5, 0.7)
-    specular: float = 0.25
-    roughness: float = 0.3
-    least_modulation: float = 0.03
-    reference_signal: float = 0.4
+    exposure_ms: float = positive(10.0)
+    projector_per_ms: float = positive(0.04)
+    ambient_per_ms: float = magnitude(0.002)
+    ambient_towards: tuple[float, float, float] = bounded(
+        (-0.5, 0.5, 0.7),
+        lambda way: len(way) == 3 and 0 < np.linalg.norm(way) < np.inf,
+        "be a direction, three numbers in the camera's frame",
+    )
+    specular: float = bounded(0.25, lambda share: 0 <= share <= 1, "lie between 0 and 1")
+    roughness: float = positive(0.3)
+    least_modulation: float = magnitude(0.03)
+    reference_signal: float = positive(0.4)
 
     def __post_init__(self) -> None:
-        for name in ("exposure_ms", "projector_per_ms", "roughness", "reference_signal"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"exposure: {name}={getattr(self, name)!r} must be positive")
-        for name in ("ambient_per_ms", "least_modulation"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"exposure: {name}={getattr(self, name)!r} must be 0 or more")
-        if not 0 <= self.specular <= 1:
-            raise InputError(f"exposure: specular={self.specular!r} must lie between 0 and 1")
-        if len(self.ambient_towards) != 3 or not 0 < np.linalg.norm(self.ambient_towards) < np.inf:
-            raise InputError(
-                f"exposure: ambient_towards={self.ambient_towards!r} must be a direction, three "
-                "numbers in the camera's frame"
-            )
+        check_fields(self, "exposure")
 
     def reflected(
         self, normals: np.ndarray, to_camera: np.ndarray, to_light: np.ndarray

@@ -17,6 +17,11 @@ from vanejax.errors import InputError
 from vanejax.scanner.camera import Camera
 from vanejax.scanner.exposure import REFERENCE_MM, Exposure
 from vanejax.scanner.range_errors import Lens, Trueness
+from vanejax.settings import bounded, check_fields, magnitude
+
+
+def _rate(default: float) -> float:
+    return bounded(default, lambda rate: 0 <= rate <= 1, "be a share from 0 to 1")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,43 +62,29 @@ class Sensor:
     """
 
     camera: Camera = dataclasses.field(default_factory=Camera)
-    baseline_mm: float = 120.0
+    baseline_mm: float = bounded(120.0, lambda x: math.isfinite(x) and x, "be a length, not 0")
     shadow: bool = False
-    max_incidence_deg: float = 90.0
-    incidence_spread_deg: float = 0.0
+    max_incidence_deg: float = bounded(90.0, lambda deg: 0 < deg <= 90, "lie in (0, 90]")
+    incidence_spread_deg: float = magnitude(0.0)
     exposure: Exposure | None = None
-    noise_px: float = 0.0
-    correlated_px: float = 0.0
-    correlation_px: float = 16.0
-    window_px: float = 0.0
-    edge_fattening_px: float = 0.0
-    border_dropout_px: float = 0.0
-    flying_pixel_rate: float = 0.0
-    jump_mm: float = 2.0
-    disparity_quantisation_px: float = 0.0
-    depth_quantisation_mm: float = 0.0
+    noise_px: float = magnitude(0.0)
+    correlated_px: float = magnitude(0.0)
+    correlation_px: float = bounded(16.0, lambda px: 1 <= px < math.inf, "be 1 or more")
+    window_px: float = magnitude(0.0)
+    edge_fattening_px: float = magnitude(0.0)
+    border_dropout_px: float = magnitude(0.0)
+    flying_pixel_rate: float = _rate(0.0)
+    jump_mm: float = magnitude(2.0)
+    disparity_quantisation_px: float = magnitude(0.0)
+    depth_quantisation_mm: float = magnitude(0.0)
     lens: Lens | None = None
     trueness: Trueness | None = None
-    dropout_rate: float = 0.0
-    outlier_rate: float = 0.0
-    outlier_mm: float = 20.0
+    dropout_rate: float = _rate(0.0)
+    outlier_rate: float = _rate(0.0)
+    outlier_mm: float = magnitude(20.0)
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.baseline_mm) and self.baseline_mm):
-            raise InputError(f"sensor: baseline_mm={self.baseline_mm!r} must be a length, not 0")
-        if not 0 < self.max_incidence_deg <= 90:
-            raise InputError(
-                f"sensor: max_incidence_deg={self.max_incidence_deg!r} must lie in (0, 90]"
-            )
-        if not 1 <= self.correlation_px < math.inf:
-            raise InputError(f"sensor: correlation_px={self.correlation_px!r} must be 1 or more")
-        for field in dataclasses.fields(self):
-            name, value = field.name, getattr(self, field.name)
-            if name.endswith("_rate") and not 0 <= value <= 1:
-                raise InputError(f"sensor: {name}={value!r} must be a share from 0 to 1")
-            magnitude = name.endswith(("_px", "_mm", "_deg")) and name != "baseline_mm"
-            if magnitude and not 0 <= value < math.inf:
-                raise InputError(f"sensor: {name}={value!r} must be 0 or more")
+        check_fields(self, "sensor")
 
     @property
     def focal_baseline(self) -> float:
