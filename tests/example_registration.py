@@ -10,15 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.cad.parametric_vane import guide_vane
 from vanejax.cad.part import Part
-from vanejax.localization.pose_result import (
-    Alternative,
-    PointStatus,
-    PoseResult,
-    Refinement,
-    Uncertainty,
-    Verdict,
-    Verification,
-)
+from vanejax.localization import pose_result
+from vanejax.localization.pose_result import PointStatus
 from vanejax.rigid import RigidTransform
 from vanejax.scanner.camera import Camera, hemisphere_viewpoints
 from vanejax.scanner.virtual_scanner import Scanner
@@ -34,7 +27,7 @@ class Registration:
 
     part: Part
     scan: MeasuredScan
-    result: PoseResult
+    result: pose_result.PoseResult
     truth: RigidTransform
 
     def replace(self, **changes: object) -> Registration:
@@ -66,12 +59,13 @@ def example_registration(status: str = "accepted") -> Registration:
     off = _motion(part, 3.0 * np.array([0.6, -0.64, 0.48]), [2.0, -1.0, 2.0])
     found = _motion(part, [0.0, 0.002, 0.0], [0.003, 0.0, -0.004]) @ truth
     flipped = _motion(part, [0.0, 0.0, 180.0], [0.0, 0.0, 0.0]) @ truth
+    alternative = pose_result.Alternative(flipped, 180.0, 0.2, 0.95)
     sigma = np.array([2e-5, 1e-5, 3e-5, 0.002, 0.003, 0.0015])
     share = {s: float((point_status == s).mean()) for s in PointStatus}
-    result = PoseResult(
+    result = pose_result.PoseResult(
         part_from_camera=found,
-        verdict=Verdict(status, f"made up to be {status}"),
-        refinement=Refinement(
+        verdict=pose_result.Verdict(status, f"made up to be {status}"),
+        refinement=pose_result.Refinement(
             part_from_camera=found,
             converged=True,
             iterations=7,
@@ -81,7 +75,7 @@ def example_registration(status: str = "accepted") -> Registration:
             num_inliers=int(np.count_nonzero(point_status == PointStatus.INLIER)),
             information=np.diag(sigma**-2),
         ),
-        uncertainty=Uncertainty(
+        uncertainty=pose_result.Uncertainty(
             covariance=np.diag(sigma**2),
             center=part.center,
             rotation_sigma_deg=np.degrees(sigma[:3]),
@@ -91,7 +85,7 @@ def example_registration(status: str = "accepted") -> Registration:
             weakest_translation_axis=np.array([0.0, 1.0, 0.0]),
             weakest_translation_sigma_mm=0.003,
         ),
-        verification=Verification(
+        verification=pose_result.Verification(
             inlier_share=share[PointStatus.INLIER],
             violation_share=share[PointStatus.BEHIND],
             unmeasured_share=0.031,
@@ -101,7 +95,7 @@ def example_registration(status: str = "accepted") -> Registration:
             deviation_mm=deviation,
             score=0.9,
         ),
-        alternatives=(Alternative(flipped, 180.0, 0.2, 0.95),) if status == "ambiguous" else (),
+        alternatives=(alternative,) if status == "ambiguous" else (),
         before=off @ truth,
         sensor_origin=np.zeros(3),
         notes=("The sensor looks along -z.",),

@@ -5,15 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vanejax.localization.pose_result import (
-    Alternative,
-    PointStatus,
-    PoseResult,
-    Refinement,
-    Uncertainty,
-    Verdict,
-    Verification,
-)
+from vanejax.localization import pose_result
+from vanejax.localization.pose_result import PointStatus
 from vanejax.rigid import RigidTransform
 
 
@@ -23,16 +16,18 @@ def pose(angles_deg: tuple[float, ...], translation_mm: tuple[float, ...]) -> Ri
     return RigidTransform(rotation, np.array(translation_mm, np.float64))
 
 
-def example_result(status: str = "accepted", *, sensor: bool = True) -> PoseResult:
+def example_result(status: str = "accepted", *, sensor: bool = True) -> pose_result.PoseResult:
     """Eight checked points, two of them no inliers; without a sensor two shares are NaN."""
     found = pose((10.0, -20.0, 30.0), (1.5, -2.25, 400.125))
     points = np.array([0, 0, 0, 0, 0, 0, 2, 3], np.uint8)
     assert points[6] == PointStatus.BEHIND
-    alternative = Alternative(pose((190.0, -20.0, 30.0), (1.5, 2.0, 400.0)), 180.0, 0.04, 0.97)
-    return PoseResult(
+    alternative = pose_result.Alternative(
+        pose((190.0, -20.0, 30.0), (1.5, 2.0, 400.0)), 180.0, 0.04, 0.97
+    )
+    return pose_result.PoseResult(
         part_from_camera=found,
-        verdict=Verdict(status, f"made up to be {status}"),
-        refinement=Refinement(
+        verdict=pose_result.Verdict(status, f"made up to be {status}"),
+        refinement=pose_result.Refinement(
             part_from_camera=found,
             converged=True,
             iterations=9,
@@ -42,7 +37,7 @@ def example_result(status: str = "accepted", *, sensor: bool = True) -> PoseResu
             num_inliers=6,
             information=np.diag(np.arange(1.0, 7.0)),
         ),
-        uncertainty=Uncertainty(
+        uncertainty=pose_result.Uncertainty(
             covariance=np.diag(1 / np.arange(1.0, 7.0)),
             center=np.array([1.0, 2.0, 3.0]),
             rotation_sigma_deg=np.array([0.001, 0.002, 0.003]),
@@ -52,7 +47,7 @@ def example_result(status: str = "accepted", *, sensor: bool = True) -> PoseResu
             weakest_translation_axis=np.array([0.0, 0.6, 0.8]),
             weakest_translation_sigma_mm=0.0061,
         ),
-        verification=Verification(
+        verification=pose_result.Verification(
             inlier_share=0.75,
             violation_share=0.125 if sensor else np.nan,
             unmeasured_share=0.031 if sensor else np.nan,

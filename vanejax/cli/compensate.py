@@ -141,13 +141,8 @@ def _check(arguments: argparse.Namespace) -> None:
         return
     from vanejax.files import check_writable
 
-    inputs = (
-        arguments.pose,
-        arguments.camera_pose,
-        arguments.nominal,
-        arguments.tool_path,
-        arguments.cad,
-    )
+    names = ("pose", "camera_pose", "nominal", "tool_path", "cad")
+    inputs = (getattr(arguments, name) for name in names)
     if os.path.realpath(arguments.out) in {os.path.realpath(path) for path in inputs if path}:
         raise InputError(f"--out {arguments.out}: is an input already; choose another name")
     check_writable(arguments.out)
