@@ -16,7 +16,7 @@ from vanejax.cad import cad_file
 from vanejax.cad.cad_file import MM_PER_UNIT, read_triangles
 from vanejax.cad.part import part_from_mesh
 from vanejax.cad.solid_bodies import connected
-from vanejax.cad.triangles import Triangles, in_use, weld
+from vanejax.cad.triangles import Triangles, weld
 from vanejax.errors import InputError
 from vanejax.files import array_header, read_head
 from vanejax.scans import point_file
@@ -229,8 +229,8 @@ def _inspect_mesh(path: Path, written: str) -> Inspection:
         mesh = weld(Triangles(vertices, faces))
         watertight = not np.any(mesh.edges.net)
         pairs = np.concatenate([mesh.faces[:, :2], mesh.faces[:, 1:]])
-        count, label = connected(pairs, len(mesh.points))
-        bodies = int(np.count_nonzero(in_use(label[mesh.faces[:, 0]], count)))
+        label = connected(pairs, len(mesh.points))
+        bodies = len(np.unique(label[mesh.faces[:, 0]]))
     name = shlex.quote(str(path))
     option = _option("cad", units)
     try:

@@ -60,7 +60,7 @@ class Voxels:
 
     def clusters(self) -> np.ndarray:
         """[V] i32: voxels that hang together have the same number, from 0."""
-        return connected(self.neighbors.T, len(self))[1]
+        return connected(self.neighbors.T, len(self))
 
     def pieces(self, sensor_origin: np.ndarray, *, least: int) -> np.ndarray:
         """[V] i32: clusters parted where the surface folds inwards, as between part and clamp.
@@ -78,7 +78,7 @@ class Voxels:
         folded = fold < -CREASE
         smooth[first[folded]] = smooth[second[folded]] = False
         inside = smooth[first] & smooth[second]
-        piece = connected(self.neighbors[:, inside].T, len(self))[1]
+        piece = connected(self.neighbors[:, inside].T, len(self))
         count = np.bincount(piece)
         core = smooth & (count[piece] >= least)
         if not core.any():
