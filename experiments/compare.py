@@ -50,7 +50,6 @@ def compare(config: Comparison, workdir: Path, runs: Mapping[str, Path]) -> dict
     config.check()
     experiment = config.experiment
     part = experiment.make_part()
-    workdir.mkdir(parents=True, exist_ok=True)
     scans = load_or_scan(experiment, part, workdir / "scans.npz")
     test = scans.test
     if not len(test):

@@ -23,7 +23,7 @@ from typing import Any
 from experiments.pages.reproduction.document import Document, document, to_markdown
 from experiments.pages.reproduction.live import evaluate_live, measure_position
 from experiments.pages.reproduction.page import to_page
-from experiments.pages.reproduction.run import estimate, measured, run_studies
+from experiments.pages.reproduction.run import estimate, make_folders, measured, run_studies
 from experiments.pages.reproduction.studies import ROOT, Outcome, chosen, recorded
 from experiments.runner import study_command as study
 from vanejax.cad import guide_vane
@@ -84,10 +84,7 @@ def full(out: Path, inputs: dict[str, str], only: str | None) -> list[Outcome]:
 
 def _page(out: Path) -> Path:
     """The page's path, after a check that it can be written."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be used as a folder ({error.strerror})") from error
+    make_folders(out)
     check_writable(out / FILE)
     return out / FILE
 

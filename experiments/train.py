@@ -53,6 +53,7 @@ def load_or_scan(config: Experiment, part: Part, path: Path) -> ScanSet:
         expected = describe_source(part, camera, viewpoints, voxel_mm)
         return load_scan_set(path, expected=expected)
     scans = make_scan_set(part, camera, viewpoints, voxel_mm=voxel_mm)
+    path.parent.mkdir(parents=True, exist_ok=True)
     scans.save(path)
     return scans
 

@@ -87,7 +87,6 @@ def tune(config: Comparison, workdir: Path, methods: Sequence[str], views: int) 
         raise InputError(f"methods {', '.join(unknown)}: only {', '.join(GRIDS)} are tuned")
     experiment = config.experiment
     part = experiment.make_part()
-    workdir.mkdir(parents=True, exist_ok=True)
     scans = load_or_scan(experiment, part, workdir / "scans.npz")
     if not len(scans.train):
         raise InputError("there are no training views to tune on")

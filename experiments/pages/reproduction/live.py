@@ -56,7 +56,6 @@ def evaluate_live(
     matcher.check_part(part)
     began = time.perf_counter()
     folder = out / FOLDER
-    folder.mkdir(parents=True, exist_ok=True)
     scans = load_or_scan(config, part, folder / "scans.npz")
     check_recipe(matcher, config)
     report = evaluate(config, scans, matcher.variables, folder, part=part)

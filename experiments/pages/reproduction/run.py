@@ -66,17 +66,22 @@ def run_studies(
     Each has its own folder in ``out``, beside logs/NAME.txt and ended/NAME.json; ``say`` receives
     the lines of progress. Raises InputError where the folder cannot be written.
     """
-    try:
-        for name in ("logs", "ended"):
-            (out / name).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be used as a folder ({error.strerror})") from error
+    make_folders(out, "logs", "ended")
     outcomes: dict[str, Outcome] = {}
     for number, study in enumerate(studies, 1):
         say(f"[{number}/{len(studies)}] {study.name}: {study.title}")
         outcomes[study.name] = outcome = _outcome(study, out, inputs, outcomes)
         say(f"    {outcome.state}" + (f": {outcome.why}" if outcome.why else ""))
     return list(outcomes.values())
+
+
+def make_folders(out: Path, *names: str) -> None:
+    """Makes a folder and those in it; InputError where that cannot be."""
+    try:
+        for folder in (out, *(out / name for name in names)):
+            folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be used as a folder ({error.strerror})") from error
 
 
 def _outcome(
