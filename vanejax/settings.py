@@ -53,7 +53,7 @@ def factor(default: float) -> Any:
 
 
 def magnitude(default: float) -> Any:
-    """A finite number of at least 0, of an effect that 0 switches off."""
+    """A finite number of at least 0, such as the size of an effect."""
     return bounded(default, _at_least_zero, "be 0 or more")
 
 
