@@ -99,6 +99,14 @@ class Surface:
         """The sample nearest to each point [n, 3]: right to about the samples' spacing."""
         return self._samples.at(self._tree.query(points)[1])
 
+    def is_smooth(self, points: np.ndarray, reach_mm: float, least_cosine: float) -> np.ndarray:
+        """[n] bool: no sample within reach of points [n, 3] faces another way than the nearest."""
+        _, index = self._tree.query(points, k=CANDIDATES * 2)
+        normals = self.normals[index]
+        aside = np.linalg.norm(self.points[index] - self.points[index[:, :1]], axis=-1)
+        same = np.einsum("nki,ni->nk", normals, normals[:, 0]) > least_cosine
+        return np.all(same | (aside > reach_mm), axis=1)
+
     def exact(self, points: np.ndarray) -> ClosestPoints:
         """The foot points on the faces of the nearest few samples, to rounding.
 

@@ -11,7 +11,8 @@ import dataclasses
 import numpy as np
 
 from vanejax.localization.covariance import uncertainty
-from vanejax.localization.fine_registration import robust_gauss_newton, subset, without_stock
+from vanejax.localization.fine_registration import robust_gauss_newton, subset
+from vanejax.localization.form_deviation import as_designed, scaled_pose
 from vanejax.localization.pose_batch import concatenate, distances, distinct, is_same, select, stack
 from vanejax.localization.pose_result import (
     Alternative,
@@ -193,10 +194,12 @@ def _verify(
     seed: int,
 ) -> Verification:
     """What the points say: of a casting, whether the part is there under its stock."""
-    pose = refinement.part_from_camera
+    pose, form = refinement.part_from_camera, refinement.form
     checked = subset(points, VERIFIED_POINTS, seed + 3)
-    if refinement.allowance_mm:
-        points = without_stock(model, points, pose, refinement.allowance_mm)
+    if form is not None and not form.is_as_designed:
+        terms = np.array([form.stock_mm, form.scale_error, form.focal_error])
+        pose = scaled_pose(pose, model.part.center, 1 / (1 + form.scale_error))
+        model, points = as_designed(model, points, pose, terms)
         tolerance_mm = float(inlier_tolerance_mm(model, stack(pose), points[checked])[0])
     view = view_of(model, points[checked])
     return verify(model, pose, points, checked, tolerance_mm=tolerance_mm, view=view)

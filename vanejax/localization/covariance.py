@@ -57,8 +57,8 @@ def inflation(information: np.ndarray, scores: np.ndarray, patches: list[np.ndar
     largest that is more than chance.
 
     Args:
-      information: [6, 6] or, with an allowance, [7, 7].
-      scores: [n, 6] or [n, 7] of the points, with zero mean.
+      information: [6, 6].
+      scores: [n, 6] of the points, with zero mean.
       patches: for each size of `PATCHES`, [n] the patch of each point.
     """
     largest = 1.0

@@ -74,8 +74,8 @@ def without_rounding(
 
 def refine_sharpened(
     model: RayCasting, scan: MeasuredScan, refinement: Refinement, sensor: Sensor, *, seed: int = 0
-) -> Refinement:
-    """The fine registration again, of the points without what the window rounds off.
+) -> tuple[Refinement, np.ndarray]:
+    """The fine registration again, of the points [N, 3] without what the window rounds off; those.
 
     Args:
       model: of the part; ``scan`` is what `check_window` takes.
@@ -92,4 +92,4 @@ def refine_sharpened(
         sharp = without_rounding(model.scanner, sensor, points, turned) * flip
         refinement = refine(model, sharp, pose, seed=seed)
         iterations += refinement.iterations
-    return dataclasses.replace(refinement, iterations=iterations)
+    return dataclasses.replace(refinement, iterations=iterations), sharp

@@ -11,12 +11,11 @@ import dataclasses
 
 import numpy as np
 
-from vanejax.errors import InputError
 from vanejax.localization.covariance import PATCHES, inflation
 from vanejax.localization.noise import LEAST_COSINE, fit_noise, weights
 from vanejax.localization.pose_batch import select, stack
 from vanejax.localization.pose_result import Refinement
-from vanejax.localization.residuals import MeasurementModel, Precision, RayCasting, Residuals, moved
+from vanejax.localization.residuals import MeasurementModel, Precision, RayCasting, moved
 from vanejax.localization.scan_patches import patch_labels
 from vanejax.rigid import RigidTransform
 from vanejax.scans.robust_statistics import robust_sigma
@@ -101,14 +100,10 @@ def refine(
     *,
     max_iterations: int = 12,
     seed: int = 0,
-    max_allowance_mm: float = 0.0,
 ) -> Refinement:
-    """One pose to the limit of what the scan's noise lets one know.
+    """One pose of a part that is its CAD model, to the limit that the scan's noise sets.
 
-    A casting has stock that its CAD model lacks: least squares then moves the part towards the
-    sensor. With ``max_allowance_mm`` a uniform offset along the outward normals is estimated as
-    a seventh unknown, and the pose's information is what is left when the offset is not known
-    (the Schur complement).
+    `form_deviation` goes on from there for a part that is not.
 
     Args:
       model: predicts points.
@@ -116,14 +111,7 @@ def refine(
       init: rough part_from_camera, [3, 3] and [3]; 5 deg and 5 mm off are no trouble.
       max_iterations: of the last stage.
       seed: of the random subsets of points in the first stages.
-      max_allowance_mm: how large that offset may be; 0 for a part that is its CAD model. It is a
-        weak prior, normal with half of this as its deviation: only where the scan cannot tell
-        the offset from a motion, as on a single plane, does it count, and takes it for a motion.
-
-    Raises:
-      InputError: a negative or infinite ``max_allowance_mm``.
     """
-    check_allowance(max_allowance_mm)
     batch = stack(init)
     coarse = points[subset(points, COARSE_POINTS, seed)]
     batch, iterations = robust_gauss_newton(model, batch, coarse, iterations=25, min_step_deg=0.02)
@@ -138,30 +126,12 @@ def refine(
         min_step_deg=0.002,
     )
     iterations += more
-    # stock moves the part until it is known: the weights of a pose that far off are no use later
-    passes = 2 if max_allowance_mm else int(len(points) > 2 * MEDIUM_POINTS)
-    allowance = 0.0
-    for size in (*passes * (MEDIUM_POINTS,), MOST_POINTS):
-        refinement = _least_squares(
-            model,
-            points[subset(points, size, seed)],
-            batch,
-            max_iterations=max_iterations,
-            allowance_mm=allowance,
-            max_allowance_mm=max_allowance_mm,
-        )
-        batch, allowance = stack(refinement.part_from_camera), refinement.allowance_mm
+    for size in (MEDIUM_POINTS, MOST_POINTS)[len(points) <= 2 * MEDIUM_POINTS :]:
+        chosen = points[subset(points, size, seed)]
+        refinement = _least_squares(model, chosen, batch, max_iterations=max_iterations)
+        batch = stack(refinement.part_from_camera)
         iterations += refinement.iterations
     return dataclasses.replace(refinement, iterations=iterations)
-
-
-def check_allowance(max_allowance_mm: float) -> None:
-    """Raises InputError for a length that stock cannot have."""
-    if not 0 <= max_allowance_mm < np.inf:
-        raise InputError(
-            f"max_allowance_mm must be 0 mm or more and finite, got {max_allowance_mm!r}; "
-            "1 mm is usual for an investment casting"
-        )
 
 
 def _least_squares(
@@ -170,21 +140,14 @@ def _least_squares(
     batch: RigidTransform,
     *,
     max_iterations: int,
-    allowance_mm: float,
-    max_allowance_mm: float,
 ) -> Refinement:
     """Gauss-Newton along the rays from one pose [1], weighted by the noise fitted on the way."""
     patches = [patch_labels(model, points, across) for across in PATCHES]
     converged = False
     weight = np.full(len(points), np.inf)
-    surface_points = points  # without the stock
-    if allowance_mm:
-        surface_points = without_stock(model, points, select(batch, 0), allowance_mm)
     for step in range(max_iterations):
-        residuals = model.residuals(batch, surface_points)
+        residuals = model.residuals(batch, points)
         columns = residuals.jacobian[0]
-        if max_allowance_mm:
-            columns = np.column_stack([columns, np.ones(len(points))])
         cosine = np.maximum(residuals.cosine[0], LEAST_COSINE)
         along = residuals.deviation_mm[0] / cosine
         if step < NOISE_FITS:  # then fixed: pose and noise would follow each other round
@@ -196,20 +159,12 @@ def _least_squares(
         scores = weighted * along[:, None]
         information = weighted.T @ (columns / cosine[:, None])
         gradient = scores.sum(axis=0)
-        if max_allowance_mm:
-            prior = (2 / max_allowance_mm) ** 2
-            information[6, 6] += prior
-            gradient[6] -= prior * allowance_mm
         delta, known = _solve(information, gradient, model.part.radius)
         information /= inflation(information, scores - scores.mean(axis=0), patches)
-        batch = moved(model.part, batch, -delta[None, :6])
-        if max_allowance_mm:
-            allowance_mm += float(delta[6])
-            surface_points = _moved_inward(points, allowance_mm, residuals, batch)
+        batch = moved(model.part, batch, -delta[None])
         if delta @ information @ delta < CONVERGED**2 * len(delta):
             converged = bool(known)
             break
-    pose_information, allowance_sigma_mm = _without_allowance(information)
     return Refinement(
         part_from_camera=select(batch, 0),
         converged=converged,
@@ -218,42 +173,8 @@ def _least_squares(
         noise_mm=float(noise.range_mm),
         num_points=len(points),
         num_inliers=int(np.count_nonzero(weight)),
-        information=pose_information,
-        allowance_mm=allowance_mm,
-        allowance_sigma_mm=allowance_sigma_mm,
+        information=information,
     )
-
-
-def without_stock(
-    model: MeasurementModel, points: np.ndarray, part_from_camera: RigidTransform, allowance: float
-) -> np.ndarray:
-    """Points [n, 3] mm, camera frame, moved inward by ``allowance`` mm along the normals at a pose.
-
-    Those of the faces that the model predicts for them under ``part_from_camera``, one pose.
-    """
-    batch = stack(part_from_camera)
-    return _moved_inward(points, allowance, model.residuals(batch, points), batch)
-
-
-def _moved_inward(
-    points: np.ndarray, allowance: float, residuals: Residuals, part_from_camera: RigidTransform
-) -> np.ndarray:
-    """Points [n, 3], camera frame, as if the stock were taken off along the faces' normals.
-
-    To take it from the deviations would be wrong by more than the noise: where the surface is
-    curved, a ray meets the CAD model elsewhere than under the stock that it ends at.
-    """
-    normals = residuals.jacobian[0][:, 3:] @ part_from_camera.rotation[0]
-    return points - allowance * normals
-
-
-def _without_allowance(information: np.ndarray) -> tuple[np.ndarray, float]:
-    """[6, 6] of the pose alone where the offset is not known, and the offset's deviation in mm."""
-    if len(information) == 6:
-        return information, 0.0
-    pose, both, offset = information[:6, :6], information[:6, 6], information[6, 6]
-    left = offset - both @ np.linalg.pinv(pose, hermitian=True) @ both
-    return pose - np.outer(both, both) / offset, float(1 / np.sqrt(max(left, 1e-12)))
 
 
 def _solve(information: np.ndarray, gradient: np.ndarray, radius: float) -> tuple[np.ndarray, bool]:
@@ -261,7 +182,7 @@ def _solve(information: np.ndarray, gradient: np.ndarray, radius: float) -> tupl
 
     Directions in which the scan knows a million times less than in the best one stay as they are.
     """
-    unit = np.array([1 / radius] * 3 + [1.0] * (len(gradient) - 3))
+    unit = np.array([1 / radius] * 3 + [1.0] * 3)
     values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
     known = values > 1e-8 * max(values[-1], 1e-30)
     along = vectors.T @ (gradient * unit)

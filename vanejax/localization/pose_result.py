@@ -35,11 +35,11 @@ class PointStatus(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How far the pose may be off, if the noise is white and the CAD model is the part.
+    """How far the pose may be off.
 
     The error is a small motion in the part's frame about the part's centre c: the true
     ``part_from_camera`` maps to ``c + exp(e[:3]) (x - c) + e[3:]`` what the reported one maps to x.
-    Left out: errors of the sensor's calibration and of the casting itself, which no noise shows.
+    Errors of the sensor's calibration count where they are given (`Calibration`), or show.
 
     Attributes:
       covariance: [6, 6], of e = (rotation vector in rad, translation in mm).
@@ -62,6 +62,43 @@ class Uncertainty:
     weakest_translation_sigma_mm: float
 
 
+@dataclasses.dataclass(frozen=True)
+class FormDeviation:
+    """How a part as scanned differs from its CAD model, see `vanejax.localization.form_deviation`.
+
+    What is 0 is not there: the scan does not prefer a model that has it. Sigmas are standard
+    deviations, the pose and all else not being known either.
+
+    Attributes:
+      stock_mm, stock_sigma_mm: uniform offset of the surface along its outward normals.
+      scale_error, scale_sigma: how much larger the scan is than the CAD model, relative: the part
+        is, or the camera's scale is off.
+      focal_error, focal_sigma: likewise, across the line of sight only: the camera's focal length.
+      field: what else there is, smooth over the surface: "none", "form" (along the normal),
+        "displacement" (in all directions alike), "range" (the sensor's), or "facing" (faces that
+        look the same way are offset alike).
+      field_mm: its standard deviation.
+      field_length_mm: over which it is smooth.
+      unexplained_share: of the patches of the scan, those that nothing explains.
+    """
+
+    stock_mm: float = 0.0
+    stock_sigma_mm: float = 0.0
+    scale_error: float = 0.0
+    scale_sigma: float = 0.0
+    focal_error: float = 0.0
+    focal_sigma: float = 0.0
+    field: str = "none"
+    field_mm: float = 0.0
+    field_length_mm: float = 0.0
+    unexplained_share: float = 0.0
+
+    @property
+    def is_as_designed(self) -> bool:
+        """Whether the scan shows no difference."""
+        return not (self.stock_mm or self.scale_error or self.focal_error or self.field_mm)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Refinement:
     """How a fine registration ended.
@@ -77,9 +114,7 @@ class Refinement:
       num_inliers: of them, those with a weight.
       information: [6, 6], J^T W J of the last step: the inverse of `Uncertainty.covariance`, in
         the same coordinates.
-      allowance_mm: the uniform offset of the surface along its outward normals, where one was
-        estimated: a casting's stock; else 0.
-      allowance_sigma_mm: its standard deviation, the pose not being known either; else 0.
+      form: how the part differs from its CAD model; None where that was not asked.
     """
 
     part_from_camera: RigidTransform
@@ -90,8 +125,7 @@ class Refinement:
     num_points: int
     num_inliers: int
     information: np.ndarray
-    allowance_mm: float = 0.0
-    allowance_sigma_mm: float = 0.0
+    form: FormDeviation | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,9 +20,11 @@ from vanejax.localization.assessment import (
     choose,
     competing_hypotheses,
 )
+from vanejax.localization.calibration import Calibration
 from vanejax.localization.clutter_removal import segmentations, with_clutter, without_clutter
 from vanejax.localization.edge_rounding import check_window, refine_sharpened
-from vanejax.localization.fine_registration import check_allowance, refine, subset
+from vanejax.localization.fine_registration import refine, subset
+from vanejax.localization.form_deviation import check_lengths, with_form_deviation
 from vanejax.localization.pose_batch import concatenate, select, stack
 from vanejax.localization.pose_result import PoseResult, Refinement
 from vanejax.localization.pose_search import Candidates, converge, initial_poses, search
@@ -52,7 +54,9 @@ def register(
     weights: TrainedMatcher | str | os.PathLike[str] | None = None,
     limits: Limits | None = None,
     segment: str = "auto",
-    max_allowance_mm: float = 0.0,
+    max_allowance_mm: float | None = None,
+    form_tolerance_mm: float | None = None,
+    calibration: Calibration | Sensor | str | None = None,
     sensor: Sensor | str | None = None,
     seed: int = 0,
 ) -> PoseResult:
@@ -80,20 +84,24 @@ def register(
         `vanejax.scans.segmentation`: "off", "on", or "auto", which does so where registration of
         the raw scan fails, or where more than a third of it is clutter. What touches the part may
         stay.
-      max_allowance_mm: for a casting with stock that its CAD model lacks: how much at most,
-        uniform. It is then estimated with the pose, see `fine_registration.refine`.
+      max_allowance_mm: how much stock a casting may have at most, uniform. It is estimated with the
+        pose, see `form_deviation`; None: there may be any; 0: there is none.
+      form_tolerance_mm: the part's form is within this of its CAD model (95 %); None where only the
+        scan tells.
+      calibration: what the sensor's calibration leaves open, or a sensor with such errors, or the
+        name of a preset; for a scan in the camera's frame. It then counts in the covariance.
       sensor: a stereo camera, or a name of `vanejax.scanner.sensor.PRESETS`, whose matching window
-        rounds edges off: that is then taken out, see `edge_rounding`. Not with an allowance.
+        rounds edges off: that is then taken out, see `edge_rounding`.
       seed: of all random subsets: same seed, same result.
 
     Raises:
       InputError: a file or a value that makes no sense; a part that the weights do not know.
     """
-    check_allowance(max_allowance_mm)
+    check_lengths(max_allowance_mm, form_tolerance_mm)
     if isinstance(sensor, str):
         sensor = preset(sensor)
-    if sensor is not None and max_allowance_mm:
-        raise InputError("a sensor's window and a casting's stock are not taken out together")
+    if calibration is not None and not isinstance(calibration, Calibration):
+        calibration = Calibration.of(calibration)
     seconds: dict[str, float] = {}
     with _timed(seconds, "read"):
         if not isinstance(part, Part):
@@ -103,7 +111,14 @@ def register(
         scan = _load_scan(scan, part, units_scan, sensor_origin)
         if sensor is not None:
             check_window(sensor, scan)
-    task = _Task(part, init, weights, limits or Limits(), max_allowance_mm, sensor, seed, seconds)
+        if calibration is not None:
+            calibration.check_frame(scan)
+    form = {
+        "max_allowance_mm": max_allowance_mm,
+        "form_tolerance_mm": form_tolerance_mm,
+        "calibration": calibration,
+    }
+    task = _Task(part, init, weights, limits or Limits(), form, sensor, seed, seconds)
     results = []
     for segments in segmentations(scan, part, segment, seed=seed):
         result = _register_segment(scan, segments, task)
@@ -121,7 +136,7 @@ class _Task:
     init: RigidTransform | None
     weights: TrainedMatcher | None
     limits: Limits
-    max_allowance_mm: float
+    form: dict[str, Any]
     sensor: Sensor | None
     seed: int
     seconds: dict[str, float]
@@ -242,7 +257,7 @@ def _localize(
         alternatives=assessment.alternatives,
         before=candidates.pose(0) if task.init is None else task.init,
         sensor_origin=scan.sensor_origin,
-        notes=(*scan.notes, *task.part.notes, *_notes(refinement, assessment)),
+        notes=(*scan.notes, *task.part.notes, *_notes(assessment)),
         seconds=task.seconds,
     )
 
@@ -251,21 +266,15 @@ def _refine(
     model: MeasurementModel, scan: MeasuredScan, pose: RigidTransform, task: _Task
 ) -> Refinement:
     """The pose on all points; without what a sensor's window rounds off, where it is given."""
-    refinement = refine(
-        model, scan.points, pose, seed=task.seed, max_allowance_mm=task.max_allowance_mm
-    )
+    points = scan.points
+    refinement = refine(model, points, pose, seed=task.seed)
     if task.sensor is not None and isinstance(model, RayCasting):
-        refinement = refine_sharpened(model, scan, refinement, task.sensor, seed=task.seed)
-    return refinement
+        refinement, points = refine_sharpened(model, scan, refinement, task.sensor, seed=task.seed)
+    return with_form_deviation(model, points, refinement, seed=task.seed, **task.form)
 
 
-def _notes(refinement: Refinement, assessment: Assessment) -> Iterator[str]:
-    """What was assumed of the stock, and what only the guess decided."""
-    if refinement.allowance_sigma_mm:
-        yield (
-            "the stock is assumed to be uniform: what varies of it moves the pose by up to as "
-            "much, which sigma does not know"
-        )
+def _notes(assessment: Assessment) -> Iterator[str]:
+    """What only the guess decided."""
     for other in assessment.ruled_out:
         yield f"a pose turned by {other.rotation_deg:.1f} deg fits as well; the guess rules it out"
 

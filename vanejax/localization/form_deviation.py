@@ -1,0 +1,388 @@
+"""How a part differs from its CAD model, estimated along with its pose.
+
+A casting has stock, has shrunk, is bent; a sensor has a scale and smooth errors of its own. Least
+squares takes much of that for a motion. Here the scan's deviations are averaged over patches of
+smooth surface, away from edges, and `random_fields` says what of them is a motion, what a term of
+the part or of the sensor, and how sure the pose still is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vanejax.errors import InputError
+from vanejax.localization.calibration import Calibration
+from vanejax.localization.fine_registration import subset
+from vanejax.localization.noise import LEAST_COSINE, fit_noise
+from vanejax.localization.pose_batch import select, stack
+from vanejax.localization.pose_result import FormDeviation, Refinement
+from vanejax.localization.random_fields import Average, Patches, Prior, average_models
+from vanejax.localization.residuals import MeasurementModel, RayCasting, Residuals, moved
+from vanejax.rigid import RigidTransform
+
+POINTS = 20_000
+PATCHES = 220
+SURFACE_POINTS = 200
+LEAST_PATCHES, LEAST_POINTS = 20, 3  # points of each patch
+CONVERGED = 0.05  # standard deviations of the pose
+# mm, and of the part's radius: what is farther off is not on the part
+MOST_DEVIATION_MM, MOST_DEVIATION = 2.0, 0.03
+# patches keep this far from edges, and 1.5 times as far as the surface is off
+MARGINS_MM = (0.3, 1.2)
+SAME_FACE_DEG = 25.0
+FLATTEST = 0.1  # cosine of incidence
+NEAR = 4.0  # standard deviations within a patch
+MOST_STEP_DEG, MOST_STEP = 2.0, 0.03  # an iteration turns and moves by no more (of the radius)
+STOCK_ITERATIONS = 2  # the face under the stock is not quite where the ray through it ends
+LIKELY = 0.5  # a term more probable than this is taken to be there
+# how many times more than elsewhere all points may know in a direction than those on smooth faces:
+# what is beyond comes from edges, which a casting has elsewhere
+MOST_BY_EDGES = 30.0
+# of scale times distance: a scan does not tell a large part from a camera with a wrong scale, which
+# would move the pose along the line of sight by that much; the bounds at 1.96 sigma hold for both
+SCALE_SIGMA = 0.6
+
+
+def check_lengths(max_allowance_mm: float | None, form_tolerance_mm: float | None) -> None:
+    """Raises InputError for lengths that stock and tolerance cannot have."""
+    if max_allowance_mm is not None and not 0 <= max_allowance_mm < np.inf:
+        raise InputError(
+            f"max_allowance_mm must be 0 mm or more and finite, got {max_allowance_mm!r}; "
+            "1 mm is usual for an investment casting"
+        )
+    if form_tolerance_mm is not None and not 0 < form_tolerance_mm < np.inf:
+        raise InputError(
+            f"form_tolerance_mm must be more than 0 mm and finite, got {form_tolerance_mm!r}; "
+            "0.3 mm is usual for an investment casting of 50 mm"
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _State:
+    """A pose of the scan divided by 1 + scale, and the terms [3], see `random_fields.TERMS`."""
+
+    pose: RigidTransform
+    terms: np.ndarray
+
+    @property
+    def factor(self) -> float:
+        return 1 + self.terms[1]
+
+
+def with_form_deviation(
+    model: MeasurementModel,
+    points: np.ndarray,
+    refinement: Refinement,
+    *,
+    max_allowance_mm: float | None = None,
+    form_tolerance_mm: float | None = None,
+    calibration: Calibration | None = None,
+    seed: int = 0,
+) -> Refinement:
+    """The refinement of a part that may differ from its CAD model.
+
+    A part that is its CAD model keeps its pose. Else pose and covariance are those of the average
+    over all models of the difference.
+
+    Args:
+      model: predicts points.
+      points: [N, 3] f64, mm, camera frame.
+      refinement: of these points, as if the part were its CAD model.
+      max_allowance_mm: the stock is between 0 and this; None: it may be any; 0: there is none.
+      form_tolerance_mm: the part's form is within this of its CAD model, in 95 of 100 places; None
+        where only the scan tells.
+      calibration: what the sensor's leaves open; of points in the camera's frame.
+      seed: of the subset of points.
+    """
+    check_lengths(max_allowance_mm, form_tolerance_mm)
+    rays = isinstance(model, RayCasting)
+    prior = Prior(
+        model.part.radius,
+        model.surface.points[:SURFACE_POINTS] - model.part.center,
+        ("form", "displacement", "range", "facing") if rays else ("form", "displacement", "facing"),
+        stock_mm=0.0 if max_allowance_mm == 0 else None,
+        form_tolerance_mm=form_tolerance_mm,
+    )
+    sample = points[subset(points, POINTS, seed + 6)]
+    fit = _Fit(model, sample, calibration)
+    estimate = fit.converge(_State(refinement.part_from_camera, np.zeros(3)), prior)
+    if estimate is None:
+        return refinement
+    if max_allowance_mm:
+        stock = estimate[0].terms[0]
+        if not 0 <= stock <= max_allowance_mm:  # then it is at the bound
+            prior = dataclasses.replace(prior, stock_mm=float(np.clip(stock, 0, max_allowance_mm)))
+            estimate = fit.converge(estimate[0], prior) or estimate
+    return _result(model, refinement, *estimate, calibrated=calibration is not None)
+
+
+class _Fit:
+    """The estimation of one scan of one part."""
+
+    def __init__(
+        self, model: MeasurementModel, points: np.ndarray, calibration: Calibration | None
+    ) -> None:
+        self.model, self.points = model, points
+        self.moves = None if calibration is None else calibration.displacements(points)
+
+    def converge(self, state: _State, prior: Prior) -> tuple[_State, Average, bool] | None:
+        """From a state to that at which the average over all models stays; None: too few patches.
+
+        Also whether it stayed.
+        """
+        margin, average, converged = MARGINS_MM[1], None, False
+        # far from the solution a rich model explains points of another face
+        for kinds, most in ((("form",), 3), (prior.kinds[:-1], 6), (prior.kinds, 6)):
+            stage = dataclasses.replace(prior, kinds=kinds)
+            for _ in range(most):
+                patches, size = self._patches(state, margin)
+                if patches is None:
+                    return None if average is None else (state, average, False)
+                average = average_models(patches, state.terms, stage)
+                state = _step(self.model, state, average.mean)
+                # nearer to the edges there may be small faces that say more
+                before, margin = margin, float(np.clip(1.5 * size, *MARGINS_MM))
+                motion = average.mean[:6]
+                squared = motion @ np.linalg.solve(average.covariance[:6, :6], motion)
+                converged = squared < CONVERGED**2 * 6 and margin > 0.7 * before
+                if converged:
+                    break
+        return state, average, converged
+
+    def _patches(self, state: _State, margin_mm: float) -> tuple[Patches | None, float]:
+        """Means over patches of smooth surface, and how far off the surface most of the points are.
+
+        None where there are too few.
+        """
+        pose = stack(state.pose)
+        model, points = as_designed(self.model, self.points, state.pose, state.terms)
+        part = model.part
+        residuals = model.residuals(pose, points)
+        deviation, normals = residuals.deviation_mm[0], residuals.jacobian[0][:, 3:]
+        cosine = np.maximum(residuals.cosine[0], LEAST_COSINE)
+        used = residuals.hit[0] & (cosine > FLATTEST)
+        used &= np.abs(deviation) < max(MOST_DEVIATION_MM, MOST_DEVIATION * part.radius)
+        used &= _smooth(model, points, pose, margin_mm)
+        if np.count_nonzero(used) < LEAST_PATCHES * LEAST_POINTS:
+            return None, 0.0
+        columns = self._columns(model, points, pose, residuals)[used]
+        positions = pose.apply(points[None])[0] - part.center - deviation[:, None] * normals
+        positions, normals = positions[used], normals[used]
+        deviation, cosine = deviation[used], cosine[used]
+        patch = _labels(positions, normals, part.radius)
+        count = np.bincount(patch)
+        rest = deviation - _medians(deviation, patch)[patch]
+        many = count[patch] >= 2 * LEAST_POINTS
+        if np.count_nonzero(many) < LEAST_PATCHES:
+            many[:] = True
+        noise = fit_noise(
+            Residuals(
+                rest[None, many],
+                columns[None, many, :6],
+                cosine[None, many],
+                np.ones((1, np.count_nonzero(many)), bool),
+            )
+        )
+        sigma = noise.sigma_mm(cosine) * cosine
+        near = np.abs(rest) < np.maximum(NEAR * sigma, 1e-3)
+        weight = np.where(near, 1 / sigma**2, 0.0)
+        kept = np.bincount(patch, near) >= LEAST_POINTS
+        if np.count_nonzero(kept) < LEAST_PATCHES:
+            return None, 0.0
+        total = np.bincount(patch, weight)
+
+        def means(values: np.ndarray) -> np.ndarray:
+            sums = [np.bincount(patch, weight * column) for column in values.T]
+            return (np.stack(sums, axis=1) / np.maximum(total, 1e-30)[:, None])[kept]
+
+        patches = Patches(
+            deviation_mm=means(deviation[:, None])[:, 0],
+            weight=total[kept],
+            columns=means(columns),
+            positions=means(positions),
+            normals=means(normals),
+            cosine=means(cosine[:, None])[:, 0],
+        )
+        return patches, float(np.percentile(np.abs(deviation + state.terms[0]), 90))
+
+    def _columns(
+        self, model: MeasurementModel, points: np.ndarray, pose: RigidTransform, at: Residuals
+    ) -> np.ndarray:
+        """[n, 9 + C], see `Patches.columns`."""
+        jacobian = at.jacobian[0]
+        normals = jacobian[:, 3:]
+        in_camera = normals @ pose.rotation[0]
+        place = pose.apply(points[None])[0] - model.part.center
+        scale = np.sum(normals * place, axis=1)
+        focal = np.sum(in_camera * across_sight(model, points), axis=1)
+        columns = [jacobian, np.ones(len(points)), scale, focal]
+        if self.moves is not None:
+            columns.append(np.einsum("ni,cni->nc", in_camera, self.moves))
+        return np.column_stack(columns)
+
+
+def as_designed(
+    model: MeasurementModel, points: np.ndarray, part_from_camera: RigidTransform, terms: np.ndarray
+) -> tuple[MeasurementModel, np.ndarray]:
+    """The model and the points [n, 3] mm as if the part had no stock and everything its true size.
+
+    Args:
+      model: of the scan as it is.
+      points: of the scan as it is.
+      part_from_camera: of the scan divided by 1 + scale.
+      terms: [3].
+    """
+    stock, scale, focal = terms
+    if scale:
+        points = points / (1 + scale)
+        if isinstance(model, RayCasting):
+            model = dataclasses.replace(model, sensor_origin=model.sensor_origin / (1 + scale))
+    if stock or focal:
+        # not from the deviations: where the surface is curved, a ray meets the CAD model elsewhere
+        # than under the stock that it ends at
+        scanned, sideways = points, across_sight(model, points)
+        for _ in range(STOCK_ITERATIONS):
+            residuals = model.residuals(stack(part_from_camera), points)
+            normals = residuals.jacobian[0][:, 3:] @ part_from_camera.rotation
+            offset = stock + focal * np.sum(normals * sideways, axis=1)
+            points = scanned - np.where(residuals.hit[0], offset, 0.0)[:, None] * normals
+    return model, points
+
+
+def across_sight(model: MeasurementModel, points: np.ndarray) -> np.ndarray:
+    """[n, 3] mm: how points move across the optical axis where the focal length is off by one.
+
+    The axis is the z axis that the sensor looks along, or the direction to the scan's middle where
+    it looks along none; all is zero where the sensor's place is not known.
+    """
+    if not isinstance(model, RayCasting):
+        return np.zeros_like(points)
+    sight = points - model.sensor_origin
+    axis = sight.mean(axis=0)
+    if abs(axis[2]) > np.hypot(axis[0], axis[1]):
+        axis = np.array([0.0, 0.0, 1.0])
+    axis = axis / np.linalg.norm(axis)
+    return sight - np.outer(sight @ axis, axis)
+
+
+def scaled_pose(
+    part_from_camera: RigidTransform, center: np.ndarray, factor: float
+) -> RigidTransform:
+    """The pose in a camera frame whose lengths are ``factor`` times as large; centre [3] mm."""
+    in_camera = part_from_camera.inverse().apply(center[None])[0] * factor
+    rotation = part_from_camera.rotation
+    return RigidTransform(rotation, center - rotation @ in_camera)
+
+
+def _step(model: MeasurementModel, state: _State, mean: np.ndarray) -> _State:
+    """The state after a step, no longer than `MOST_STEP`."""
+    turn, shift = np.linalg.norm(mean[:3]), np.linalg.norm(mean[3:6])
+    most = max(turn / np.radians(MOST_STEP_DEG), shift / (MOST_STEP * model.part.radius), 1.0)
+    pose = select(moved(model.part, stack(state.pose), -mean[None, :6] / most), 0)
+    terms = state.terms + mean[6:] / most
+    # a larger part stays where it is
+    factor = state.factor / (1 + terms[1])
+    return _State(scaled_pose(pose, model.part.center, factor), terms)
+
+
+def _smooth(
+    model: MeasurementModel, points: np.ndarray, pose: RigidTransform, margin_mm: float
+) -> np.ndarray:
+    """[n] whether all surface around a point is of one smooth face, as far as the margin."""
+    least = np.cos(np.radians(SAME_FACE_DEG))
+    if not isinstance(model, RayCasting):
+        return model.surface.is_smooth(pose.apply(points[None])[0], margin_mm, least)
+    rays = points - model.sensor_origin
+    forward = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
+    across = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
+    across /= np.linalg.norm(across)
+    sensor = pose.apply(np.asarray(model.sensor_origin, np.float64)[None, None])[0, 0]
+    sensor = sensor - model.part.center
+
+    def cast(aside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        turned = (rays + aside) @ pose.rotation[0].T
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+        hits = model.scanner.cast_unit(sensor[None, None], turned[None])
+        return hits.face[0] >= 0, hits.normals[0], hits.distance_mm[0]
+
+    smooth, normals, distance = cast(np.zeros(3))
+    for angle in np.arange(6) * np.pi / 3:
+        aside = np.cos(angle) * across + np.sin(angle) * np.cross(forward, across)
+        hit, others, other = cast(margin_mm * aside)
+        smooth &= hit & (np.sum(normals * others, axis=1) > least)
+        smooth &= ~(
+            np.abs(np.where(hit, other, 0) - np.where(smooth, distance, 0)) > 8 * margin_mm
+        )  # as slanted as `FLATTEST`
+    return smooth
+
+
+def _labels(positions: np.ndarray, normals: np.ndarray, radius_mm: float) -> np.ndarray:
+    """[n] i64, 0, 1, ...: cubes of one size, faces of six directions apart, some `PATCHES`."""
+    axis = np.argmax(np.abs(normals), axis=1)
+    facing = 2 * axis + (np.take_along_axis(normals, axis[:, None], axis=1)[:, 0] > 0)
+    size = radius_mm / 8
+    for _ in range(6):
+        cells = np.column_stack([np.floor(positions / size).astype(np.int64), facing])
+        patch = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+        count = int(patch.max()) + 1
+        if count <= 1.2 * PATCHES:
+            break
+        size *= np.sqrt(count / PATCHES)
+    return patch
+
+
+def _medians(values: np.ndarray, patch: np.ndarray) -> np.ndarray:
+    """[M] the lower median of the values [n] in each patch."""
+    order = np.lexsort((values, patch))
+    count = np.bincount(patch)
+    first = np.cumsum(count) - count
+    return values[order][first + (count - 1) // 2]
+
+
+def _result(
+    model: MeasurementModel,
+    refinement: Refinement,
+    state: _State,
+    average: Average,
+    converged: bool,
+    *,
+    calibrated: bool,
+) -> Refinement:
+    """What the result says of the part's form, its pose and its covariance."""
+    sigma = np.sqrt(np.maximum(np.diag(average.covariance)[6:], 0))
+    present = average.term_probability > LIKELY
+    stock, scale, focal = np.where(present, state.terms, 0.0)
+    field = average.field_probability > LIKELY
+    form = FormDeviation(
+        stock_mm=float(stock),
+        stock_sigma_mm=float(sigma[0]) if present[0] else 0.0,
+        scale_error=float(scale),
+        scale_sigma=float(sigma[1]) if present[1] else 0.0,
+        focal_error=float(focal),
+        focal_sigma=float(sigma[2]) if present[2] else 0.0,
+        field=average.field.kind if field else "none",
+        field_mm=average.amplitude_mm if field else 0.0,
+        field_length_mm=average.field.length * model.part.radius if field else 0.0,
+        unexplained_share=float(np.mean(average.outliers)),
+    )
+    if form.is_as_designed and not calibrated:
+        surfaces = np.linalg.inv(average.covariance[:6, :6])
+        fixed_by = np.linalg.eigvals(np.linalg.solve(surfaces, refinement.information)).real
+        if fixed_by.max() > MOST_BY_EDGES * np.sort(fixed_by)[1]:
+            refinement = dataclasses.replace(refinement, information=surfaces)
+        return dataclasses.replace(refinement, form=form)
+    pose = scaled_pose(state.pose, model.part.center, state.factor)
+    covariance = average.covariance[:6, :6].copy()
+    if scale and isinstance(model, RayCasting):
+        in_camera = pose.inverse().apply(model.part.center[None])[0] - model.sensor_origin
+        sight = SCALE_SIGMA * scale * (pose.rotation @ in_camera)
+        covariance[3:, 3:] += np.outer(sight, sight)
+    return dataclasses.replace(
+        refinement,
+        part_from_camera=pose,
+        converged=converged,
+        information=np.linalg.inv(covariance),
+        form=form,
+    )
