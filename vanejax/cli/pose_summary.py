@@ -30,10 +30,12 @@ def summary(result: PoseResult, *, color: bool, seconds: Mapping[str, float]) ->
       color: whether the terminal takes colours.
       seconds: of each stage, in order; the whole last.
     """
+    from vanejax.localization.verdict import in_words
     from vanejax.machine.pose_file import pose_to_dict
 
     numbers = pose_to_dict(result.part_from_camera)["part_from_camera_as"]
     uncertainty, checks, refinement = result.uncertainty, result.verification, result.refinement
+    differences = list(in_words(refinement.form)) or ["no difference from the CAD model shows"]
     ended = "converged" if refinement.converged else "NOT CONVERGED"
     lines = [
         verdict_line(result.verdict, color=color),
@@ -57,11 +59,7 @@ def summary(result: PoseResult, *, color: bool, seconds: Mapping[str, float]) ->
         f"{refinement.iterations} iterations, {ended}, "
         f"{refinement.num_inliers:,} of {refinement.num_points:,} points",
     ]
-    if refinement.allowance_sigma_mm:
-        lines.append(
-            f"  stock        {_number(refinement.allowance_mm)} mm uniform, sigma "
-            f"{_number(refinement.allowance_sigma_mm)} mm"
-        )
+    lines += [f"  {'form' if k == 0 else '':<12} {words}" for k, words in enumerate(differences)]
     if result.alternatives:
         lines.append("alternatives (from the pose above)")
     for number, other in enumerate(result.alternatives, 1):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 import sys
 import time
 from pathlib import Path
@@ -15,6 +16,8 @@ from vanejax.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
+
+    from vanejax.localization.verdict import Limits
 
 EXIT_CODES = {"accepted": 0, "ambiguous": 3, "rejected": 4}
 
@@ -58,9 +61,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--max-allowance-mm",
         type=float,
-        default=0.0,
         metavar="MM",
-        help="for a casting: the largest uniform stock it may have; it is then estimated (0)",
+        help="the largest uniform stock that a casting may have, 0 for none; by default as much as "
+        "the scan shows",
+    )
+    parser.add_argument(
+        "--form-tolerance-mm",
+        type=float,
+        metavar="MM",
+        help="how far the part's surface may be from its CAD model, 95 %% of it; by default only "
+        "the scan tells",
+    )
+    parser.add_argument(
+        "--calibration",
+        metavar="NAME",
+        help="a sensor whose errors of calibration count in sigma: paper_camera",
+    )
+    parser.add_argument(
+        "--tolerance",
+        default="1mm,0.5deg",
+        metavar="MM,DEG",
+        help="what the job needs: a pose whose 95 %% bounds are wider is not accepted (1mm,0.5deg)",
     )
     parser.add_argument(
         "--sensor",
@@ -84,6 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     started = time.perf_counter()
     origin = parse_sensor_origin(arguments.sensor_origin)
+    limits = parse_tolerance(arguments.tolerance)
     _check_outputs(arguments)
 
     from vanejax.machine.pose_file import read_pose, write_result
@@ -116,7 +138,10 @@ def run(arguments: argparse.Namespace) -> int:
         init=init,
         weights=matcher,
         segment=arguments.segment,
+        limits=limits,
         max_allowance_mm=arguments.max_allowance_mm,
+        form_tolerance_mm=arguments.form_tolerance_mm,
+        calibration=arguments.calibration,
         sensor=arguments.sensor,
         seed=arguments.seed,
     )
@@ -164,6 +189,26 @@ def parse_sensor_origin(text: str) -> str | np.ndarray:
     import numpy as np
 
     return np.array(values)
+
+
+def parse_tolerance(text: str) -> Limits:
+    """Limits of a verdict from ``0.1mm,0.05deg``.
+
+    Raises:
+      InputError: anything else.
+    """
+    from vanejax.localization.verdict import Limits
+
+    found = re.fullmatch(r"\s*([\d.e+-]+)\s*mm\s*,\s*([\d.e+-]+)\s*deg\s*", text)
+    try:
+        values = [float(word) for word in found.groups()] if found else []
+    except ValueError:
+        values = []
+    if len(values) != 2 or not all(0 < value < math.inf for value in values):
+        raise InputError(
+            f"--tolerance {text}: should be two lengths above 0, such as 0.1mm,0.05deg"
+        )
+    return Limits(tolerance_mm=values[0], tolerance_deg=values[1])
 
 
 def wants_color() -> bool:

@@ -123,7 +123,14 @@ def assess(
     )
     verification = _verify(model, points, refinement, tolerance, seed)
     sigma = uncertainty(refinement, part.center)
-    verdict = judge(verification, sigma, competing, radius_mm=part.radius, limits=limits)
+    verdict = judge(
+        verification,
+        sigma,
+        competing,
+        radius_mm=part.radius,
+        form=refinement.form,
+        limits=limits,
+    )
     alternatives = ()
     if verdict.status == "ambiguous":
         allowed = [other for other in competing if other.preference < limits.least_preference]

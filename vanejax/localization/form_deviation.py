@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from vanejax.errors import InputError
 from vanejax.localization.calibration import Calibration
@@ -107,14 +108,16 @@ def with_form_deviation(
     )
     sample = points[subset(points, POINTS, seed + 6)]
     fit = _Fit(model, sample, calibration)
-    estimate = fit.converge(_State(refinement.part_from_camera, np.zeros(3)), prior)
+    with threadpool_limits(1):  # the matrices are small: threads would wait for each other
+        estimate = fit.converge(_State(refinement.part_from_camera, np.zeros(3)), prior)
     if estimate is None:
-        return refinement
+        return dataclasses.replace(refinement, form=FormDeviation(is_told=False))
     if max_allowance_mm:
         stock = estimate[0].terms[0]
         if not 0 <= stock <= max_allowance_mm:  # then it is at the bound
             prior = dataclasses.replace(prior, stock_mm=float(np.clip(stock, 0, max_allowance_mm)))
-            estimate = fit.converge(estimate[0], prior) or estimate
+            with threadpool_limits(1):
+                estimate = fit.converge(estimate[0], prior) or estimate
     return _result(model, refinement, *estimate, calibrated=calibration is not None)
 
 
@@ -366,6 +369,7 @@ def _result(
         field_mm=average.amplitude_mm if field else 0.0,
         field_length_mm=average.field.length * model.part.radius if field else 0.0,
         unexplained_share=float(np.mean(average.outliers)),
+        converged=converged,
     )
     if form.is_as_designed and not calibrated:
         surfaces = np.linalg.inv(average.covariance[:6, :6])

@@ -15,6 +15,7 @@ import numpy as np
 
 from vanejax.rigid import RigidTransform
 
+BOUND = 1.96  # standard deviations: 95 %
 Status = Literal["accepted", "ambiguous", "rejected"]
 
 
@@ -61,6 +62,16 @@ class Uncertainty:
     weakest_translation_axis: np.ndarray
     weakest_translation_sigma_mm: float
 
+    @property
+    def rotation_bound_deg(self) -> float:
+        """What the error about the weakest axis exceeds in 5 of 100 cases."""
+        return BOUND * self.weakest_rotation_sigma_deg
+
+    @property
+    def translation_bound_mm(self) -> float:
+        """What the error in the weakest direction exceeds in 5 of 100 cases."""
+        return BOUND * self.weakest_translation_sigma_mm
+
 
 @dataclasses.dataclass(frozen=True)
 class FormDeviation:
@@ -80,6 +91,8 @@ class FormDeviation:
       field_mm: its standard deviation.
       field_length_mm: over which it is smooth.
       unexplained_share: of the patches of the scan, those that nothing explains.
+      converged: whether the estimate stayed the same in the end.
+      is_told: whether there was enough smooth surface to tell.
     """
 
     stock_mm: float = 0.0
@@ -92,6 +105,8 @@ class FormDeviation:
     field_mm: float = 0.0
     field_length_mm: float = 0.0
     unexplained_share: float = 0.0
+    converged: bool = True
+    is_told: bool = True
 
     @property
     def is_as_designed(self) -> bool:
@@ -114,7 +129,7 @@ class Refinement:
       num_inliers: of them, those with a weight.
       information: [6, 6], J^T W J of the last step: the inverse of `Uncertainty.covariance`, in
         the same coordinates.
-      form: how the part differs from its CAD model; None where that was not asked.
+      form: how the part differs from its CAD model; None where nobody asked.
     """
 
     part_from_camera: RigidTransform

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 
-from vanejax.localization.pose_result import Uncertainty, Verdict, Verification
+from vanejax.localization.pose_result import FormDeviation, Uncertainty, Verdict, Verification
 from vanejax.rigid import RigidTransform
 
 
@@ -29,8 +29,11 @@ class Limits:
       least_inliers: points.
       least_preference: how many standard errors the patches of the scan must prefer the pose to
         each other pose that was tried.
-      most_rotation_sigma_deg, most_translation_sigma: in the weakest direction; the second of the
-        part's radius.
+      tolerance_deg, tolerance_mm: what the job needs: the 95 % bounds of the pose, in its
+        weakest directions, are to be within.
+      most_field_mm: standard deviation of a smooth deviation of form; above it no pose is certain,
+        since a deviation that large is seldom random: it is stock on one side, or a bend.
+      most_unexplained_share: of the scan's patches, those that no model of the part's form explains.
     """
 
     least_inlier_share: float = 0.6
@@ -41,8 +44,10 @@ class Limits:
     least_support: float = 0.7
     least_inliers: int = 40
     least_preference: float = 4.0
-    most_rotation_sigma_deg: float = 1.0
-    most_translation_sigma: float = 0.01
+    tolerance_deg: float = 0.5
+    tolerance_mm: float = 1.0
+    most_field_mm: float = 0.25
+    most_unexplained_share: float = 0.05
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,19 +72,56 @@ def judge(
     competing: Sequence[CompetingHypothesis],
     *,
     radius_mm: float,
+    form: FormDeviation | None = None,
     limits: Limits | None = None,
 ) -> Verdict:
-    """The verdict on a refined pose; the first reason that holds is given."""
+    """The verdict on a refined pose; the first reason that holds is given.
+
+    How the part differs from its CAD model is named in every verdict that is not a rejection.
+    """
     limits = limits or Limits()
     for reason in _faults(verification, radius_mm, limits):
         return Verdict("rejected", reason)
-    for reason in _doubts(verification, uncertainty, competing, radius_mm, limits):
-        return Verdict("ambiguous", reason)
+    differences = "".join(f"; {words}" for words in in_words(form))
+    for reasons in (
+        _doubts(verification, competing, radius_mm, limits),
+        _doubts_of_form(form, limits),
+        _doubts_of_bounds(uncertainty, form, limits),
+    ):
+        for reason in reasons:
+            return Verdict("ambiguous", reason + differences)
     return Verdict(
         "accepted",
         f"{verification.inlier_share:.1%} of the points lie on the part within "
-        f"{verification.tolerance_mm:.3g} mm, and no other pose comes near",
+        f"{verification.tolerance_mm:.3g} mm, and no other pose comes near{differences}",
     )
+
+
+def in_words(form: FormDeviation | None) -> Iterator[str]:
+    """How a part as scanned differs from its CAD model, each difference with its figure."""
+    if form is None:
+        return
+    if form.stock_mm:
+        yield f"stock {form.stock_mm:.3f} +- {form.stock_sigma_mm:.3f} mm"
+    if form.scale_error:
+        word = "larger" if form.scale_error > 0 else "smaller"
+        yield (
+            f"the scan is {abs(form.scale_error):.2%} +- {form.scale_sigma:.2%} {word} than the "
+            "CAD model"
+        )
+    if form.focal_error:
+        yield (
+            f"the camera's focal length is off by {form.focal_error:+.2%} +- {form.focal_sigma:.2%}"
+        )
+    if form.field != "none":
+        what = {
+            "form": "the surface varies",
+            "displacement": "the part is distorted",
+            "range": "the sensor's range varies",
+            "facing": "faces of different directions are offset",
+        }[form.field]
+        length = f" over {form.field_length_mm:.0f} mm" if form.field_length_mm else ""
+        yield f"{what} by {form.field_mm:.2g} mm{length}"
 
 
 def _faults(verification: Verification, radius_mm: float, limits: Limits) -> Iterator[str]:
@@ -112,7 +154,6 @@ def _faults(verification: Verification, radius_mm: float, limits: Limits) -> Ite
 
 def _doubts(
     verification: Verification,
-    uncertainty: Uncertainty,
     competing: Sequence[CompetingHypothesis],
     radius_mm: float,
     limits: Limits,
@@ -146,17 +187,60 @@ def _doubts(
             f"the points lie {noise:.2g} mm off the surface, {noise / radius_mm:.1%} of the part's "
             "radius: the pose is the best one, but may be off by more than its uncertainty says"
         )
-    if uncertainty.weakest_rotation_sigma_deg > limits.most_rotation_sigma_deg:
+
+
+def _doubts_of_form(form: FormDeviation | None, limits: Limits) -> Iterator[str]:
+    """Why what the part differs by leaves the pose open."""
+    if form is None:
+        return
+    if not form.is_told:
         yield (
-            "the scan hardly fixes the rotation about "
-            f"{_axis(uncertainty.weakest_rotation_axis)}: "
-            f"{uncertainty.weakest_rotation_sigma_deg:.2f} deg standard deviation"
+            "too little smooth surface was measured to tell whether the part is like its CAD model"
         )
-    if uncertainty.weakest_translation_sigma_mm > limits.most_translation_sigma * radius_mm:
+    if form.unexplained_share > limits.most_unexplained_share:
         yield (
-            "the scan hardly fixes the position along "
-            f"{_axis(uncertainty.weakest_translation_axis)}: "
-            f"{uncertainty.weakest_translation_sigma_mm:.2f} mm standard deviation"
+            f"{form.unexplained_share:.0%} of the surface is not where the CAD model has it, and no "
+            "smooth deviation explains that: missing or extra material, or another part"
+        )
+    if form.field == "facing":
+        yield (
+            f"faces that look in different directions are offset by some {form.field_mm:.2g} mm, as "
+            "by stock on a few faces only: the pose may be off by as much"
+        )
+    elif form.field_mm > limits.most_field_mm:
+        yield (
+            f"the part differs from its CAD model by {form.field_mm:.2g} mm: so much is seldom random, "
+            "and the pose may be off by as much"
+        )
+    if not form.converged:
+        yield (
+            "the part differs from its CAD model in a way that no model of its form explains: the "
+            "estimate did not converge"
+        )
+
+
+def _doubts_of_bounds(
+    uncertainty: Uncertainty, form: FormDeviation | None, limits: Limits
+) -> Iterator[str]:
+    """Why the pose is not as certain as the job needs."""
+    help_ = "a view of other sides would help"
+    if form is not None and form.scale_error:
+        help_ = (
+            "a single view does not tell a part of another size from a camera with a wrong scale: "
+            "check the camera on a gauge, and the unit"
+        )
+    elif form is not None and form.field != "none":
+        help_ += ", or a tighter casting"
+    deg, mm = uncertainty.rotation_bound_deg, uncertainty.translation_bound_mm
+    if deg > limits.tolerance_deg:
+        yield (
+            f"the rotation about {_axis(uncertainty.weakest_rotation_axis)} is known to {deg:.2g} "
+            f"deg only (95 %), and the job needs {limits.tolerance_deg:g} deg: {help_}"
+        )
+    if mm > limits.tolerance_mm:
+        yield (
+            f"the position along {_axis(uncertainty.weakest_translation_axis)} is known to "
+            f"{mm:.2g} mm only (95 %), and the job needs {limits.tolerance_mm:g} mm: {help_}"
         )
 
 
