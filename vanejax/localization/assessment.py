@@ -36,6 +36,7 @@ VERIFIED_POINTS = 100_000
 LEAST_TOLERANCE, MOST_TOLERANCE = 0.001, 0.12
 # a guess is good to this; a pose farther away that fits as well is no reason to doubt it
 GUESS_DEG, GUESS_SHIFT = 30.0, 0.3
+ALIKE = 0.95  # of the inliers: other poses with as many are listed
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -133,9 +134,16 @@ def assess(
     )
     alternatives = ()
     if verdict.status == "ambiguous":
-        allowed = [other for other in competing if other.preference < limits.least_preference]
-        allowed.sort(key=lambda other: other.preference)
-        alternatives = tuple(_alternative(model, other, sample, tolerance) for other in allowed)
+        listed = [(other, _alternative(model, other, sample, tolerance)) for other in competing]
+        # a pose that explains the points as well may be right where the scan was cropped
+        least = ALIKE * verification.inlier_share
+        listed = [
+            (other.preference, alternative)
+            for other, alternative in listed
+            if other.preference < limits.least_preference or alternative.inlier_share >= least
+        ]
+        listed.sort(key=lambda pair: pair[0])
+        alternatives = tuple(alternative for _, alternative in listed)
     return Assessment(verification, sigma, competing, ruled_out, alternatives, verdict)
 
 

@@ -44,6 +44,7 @@ def robust_gauss_newton(
     iterations: int,
     precision: Precision = "grid",
     floor_mm: float | None = None,
+    ceiling_mm: float | None = None,
     min_step_deg: float = 0.0,
 ) -> tuple[RigidTransform, int]:
     """Robust Gauss-Newton from a batch of poses, on the same points for all of them.
@@ -59,7 +60,8 @@ def robust_gauss_newton(
       points: [n, 3] mm, camera frame.
       iterations: at most.
       precision: as in `MeasurementModel.residuals`.
-      floor_mm: the kernel's scale is no smaller; default 1 % of the part's radius.
+      floor_mm, ceiling_mm: the kernel's scale is no smaller, default 1 % of the part's radius, and
+        no larger, default 30 %.
       min_step_deg: a pose that turns by less, and moves by less of the part's radius, is left.
 
     Returns:
@@ -77,7 +79,7 @@ def robust_gauss_newton(
         residuals = model.residuals(poses, points, precision=precision)
         deviation = residuals.deviation_mm
         scale = robust_sigma(deviation, axis=1)
-        scale = 2 * np.clip(scale, floor, 0.3 * radius)[:, None]
+        scale = 2 * np.clip(scale, floor, ceiling_mm or 0.3 * radius)[:, None]
         weight = 1 / (1 + (deviation / scale) ** 2) ** 2
         weighted = residuals.jacobian * weight[..., None]
         information = weighted.swapaxes(-1, -2) @ residuals.jacobian

@@ -152,6 +152,8 @@ class Verification:
       violation_share: points of status BEHIND, 0 to 1; NaN where the sensor's place is unknown.
       unmeasured_share: of the part's surface that the sensor should have seen, what has no
         measurement, 0 to 1; NaN where the sensor's place is unknown.
+      missing_share: likewise, without what is outside the measured region: that may have been cut
+        off.
       tolerance_mm: the largest deviation of an inlier.
       checked: [n] i64, which points of the scan were checked.
       status: [n] u8, their `PointStatus`.
@@ -163,6 +165,7 @@ class Verification:
     inlier_share: float
     violation_share: float
     unmeasured_share: float
+    missing_share: float
     tolerance_mm: float
     checked: np.ndarray
     status: np.ndarray

@@ -3,8 +3,8 @@
 The basin of `robust_gauss_newton` is tens of degrees wide, so a few hundred rotations reach every
 pose; points whose ray misses the part are pulled to its surface, which more than doubles the share
 of the initial poses that arrive. Candidates are sorted by what the scan says for them
-(`verification.evidence`). The best is then turned about its own axes, and shifted along them, to
-the poses at which a part of that shape may look alike: the symmetry hypotheses.
+(`verification.evidence`). The best is then moved by the part's near symmetries, to the poses at
+which the part may look alike: the symmetry hypotheses.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vanejax.cad.surface import Surface
 from vanejax.localization.fine_registration import robust_gauss_newton, subset
 from vanejax.localization.pose_batch import concatenate, distinct, select
 from vanejax.localization.residuals import MeasurementModel, RayCasting
 from vanejax.localization.scan_patches import view_of
+from vanejax.localization.self_similarity import moved_by, self_similar_motions
 from vanejax.localization.verification import evidence
 from vanejax.rigid import RigidTransform
 from vanejax.scans.robust_statistics import robust_sigma
@@ -29,11 +29,7 @@ INITIAL_ITERATIONS = 12
 MOST_CANDIDATES = 16
 CANDIDATE_POINTS = 3_000
 CANDIDATE_ITERATIONS = 15
-# symmetries of order 2 to 12, and of gears
-SYMMETRY_TURNS_DEG = (
-    180,
-    *(sign * turn for turn in (120, 90, 72, 60, 45, 36, 30, 20, 15) for sign in (1, -1)),
-)
+SYMMETRY_SEEDS = 3  # of the best candidates, those whose similar poses are tried
 MOST_SYMMETRY_HYPOTHESES = 12
 SYMMETRY_POINTS = 600
 SYMMETRY_ITERATIONS = 10
@@ -145,11 +141,13 @@ def converge(
 def add_symmetry_hypotheses(
     model: MeasurementModel, points: np.ndarray, candidates: Candidates, *, seed: int = 0
 ) -> Candidates:
-    """The candidates and the best `symmetry_hypotheses` that end elsewhere, sorted anew."""
+    """The candidates, and the best moved by the part's own similarities, sorted anew."""
     sample = points[subset(points, SYMMETRY_POINTS, seed + 4)]
+    motions = self_similar_motions(model.part)
+    seeds = range(min(SYMMETRY_SEEDS, len(candidates)))
     symmetric, _ = robust_gauss_newton(
         model,
-        symmetry_hypotheses(model.surface, candidates.pose(0)),
+        concatenate(*(moved_by(motions, candidates.pose(k)) for k in seeds)),
         sample,
         iterations=SYMMETRY_ITERATIONS,
         min_step_deg=0.2,
@@ -160,27 +158,6 @@ def add_symmetry_hypotheses(
     best = ranked.score[0]
     kept = ranked.score >= best - (1 - LEAST_SCORE) * abs(best)
     return Candidates(select(ranked.part_from_camera, kept), ranked.score[kept])
-
-
-def symmetry_hypotheses(surface: Surface, best: RigidTransform) -> RigidTransform:
-    """Poses where a part of this shape may look as at the best one, turned and shifted.
-
-    Turned by `SYMMETRY_TURNS_DEG` about the three principal axes of its surface, and by 180 deg
-    about the diagonals between them, about the middle of the surface; and shifted along the three
-    axes by an eighth and a quarter of the length: the pitch of repeated features.
-    """
-    middle, axes = surface.moments
-    turns = [axis * np.radians(angle) for axis in axes for angle in SYMMETRY_TURNS_DEG]
-    for i, j in ((0, 1), (1, 2), (0, 2)):
-        turns += [np.pi * ((axes[i] + sign * axes[j]) / np.sqrt(2)) for sign in (1, -1)]
-    turn = Rotation.from_rotvec(np.stack(turns)).as_matrix()
-    turned = RigidTransform(turn @ best.rotation, turn @ (best.translation - middle) + middle)
-    length = np.ptp(surface.points @ axes.T, axis=0)
-    shifts = np.stack(
-        [s * length[k] * axes[k] for k in range(3) for s in (0.125, -0.125, 0.25, -0.25)]
-    )
-    rotation = np.broadcast_to(best.rotation, (len(shifts), 3, 3))
-    return concatenate(turned, RigidTransform(rotation, best.translation + shifts))
 
 
 def noise_level(model: MeasurementModel, poses: RigidTransform, points: np.ndarray) -> np.ndarray:

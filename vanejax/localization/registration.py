@@ -26,7 +26,7 @@ from vanejax.localization.edge_rounding import check_window, refine_sharpened
 from vanejax.localization.fine_registration import refine, subset
 from vanejax.localization.form_deviation import check_lengths, with_form_deviation
 from vanejax.localization.pose_batch import concatenate, select, stack
-from vanejax.localization.pose_result import PoseResult, Refinement
+from vanejax.localization.pose_result import PoseResult, Refinement, Verdict
 from vanejax.localization.pose_search import Candidates, converge, initial_poses, search
 from vanejax.localization.residuals import MeasurementModel, RayCasting, measurement_model
 from vanejax.localization.verdict import Limits
@@ -159,20 +159,25 @@ def _register_segment(scan: MeasuredScan, segments: Segments | None, task: _Task
 
 
 def _register_from_sensor(scan: MeasuredScan, task: _Task) -> PoseResult:
-    """The pose of the part, also where the assumed sensor origin turns out to be wrong."""
+    """The pose of the part; where the assumed sensor origin rules out every pose, an ambiguous one.
+
+    What the rays from the assumed origin refuse is never accepted without them.
+    """
     result = _register_points(scan, task, SEARCH_ROTATIONS)
-    if scan.origin_is_assumed and not task.is_sound(result):
-        # perhaps the cloud was moved after it was taken: then the rays are wrong, not the pose
-        note = (
-            "seen from the scan's origin the part does not fit, from anywhere it does: the "
-            "sensor's place is taken as unknown"
-        )
-        merged = dataclasses.replace(scan, sensor_origin=None, notes=(*scan.notes, note))
-        without_weights = dataclasses.replace(task, weights=None)
-        other = _register_points(merged, without_weights, SEARCH_ROTATIONS[:1])
-        if other.verdict.status == "accepted":
-            return other
-    return result
+    if not scan.origin_is_assumed or result.verdict.status != "rejected":
+        return result
+    merged = dataclasses.replace(scan, sensor_origin=None)
+    without_weights = dataclasses.replace(task, weights=None)
+    other = _register_points(merged, without_weights, SEARCH_ROTATIONS[:1])
+    if other.verdict.status == "rejected":
+        return result
+    verdict = Verdict(
+        "ambiguous",
+        f"seen from the scan's origin the part fits nowhere ({result.verdict.reason}); were the "
+        "sensor's place unknown, it would fit here. If the cloud was moved or merged, say so "
+        "(--sensor-origin unknown); if not, the part is not like its CAD model, or another one",
+    )
+    return dataclasses.replace(other, verdict=verdict)
 
 
 def _register_points(scan: MeasuredScan, task: _Task, rotations: tuple[int, ...]) -> PoseResult:

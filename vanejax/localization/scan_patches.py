@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import binary_dilation
+from scipy.spatial import ConvexHull, QhullError
 
 from vanejax.localization.residuals import MeasurementModel, RayCasting
 
@@ -72,12 +73,15 @@ class View:
         # a hole as wide as a cell is the sampling's, not the sensor's
         self._near_measured = binary_dilation(occupied, np.ones((3, 3), bool))
         self.patch = self._patch(cells)
+        self._hull = _hull(cells + 0.5)
 
     def _patch(self, cells: np.ndarray) -> np.ndarray:
         """One number per patch of cells, the same for points and empty cells."""
         return cell_labels(np.floor_divide(cells, self.patch_cells)[:, ::-1])
 
-    def empty_cells(self, center: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    def empty_cells(
+        self, center: np.ndarray, radius: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rays [m, 3], unit, through cells without measurement where a sphere would be seen.
 
         Args:
@@ -85,7 +89,8 @@ class View:
           radius: mm.
 
         Returns:
-          the rays and their patches [m].
+          the rays, their patches [m], and whether they are among the measured ones [m] bool: within
+          the convex hull of all that was measured. What is outside of it may have been cut off.
         """
         offset = self.axes @ (center - self.sensor_origin)
         depth = max(offset[2], 1.05 * radius)
@@ -102,4 +107,13 @@ class View:
         cells = cells[~measured]
         image = (cells + 0.5) * self.size + self.low
         rays = np.concatenate([image, np.ones((len(image), 1))], axis=1) @ self.axes
-        return rays / np.linalg.norm(rays, axis=1, keepdims=True), self._patch(cells)
+        among = np.all((cells + 0.5) @ self._hull[:, :2].T + self._hull[:, 2] < 0, axis=1)
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True), self._patch(cells), among
+
+
+def _hull(cells: np.ndarray) -> np.ndarray:
+    """[k, 3] (a, b, c): a point (x, y) is within the convex hull where all ``a x + b y + c < 0``."""
+    try:
+        return ConvexHull(np.unique(cells, axis=0)).equations
+    except QhullError:  # all in one line
+        return np.array([[0.0, 0.0, 1.0]])

@@ -19,7 +19,7 @@ class Limits:
     Attributes:
       least_inlier_share: of the points; clutter and other parts count against it.
       most_violation_share: of the points, those seen through material.
-      most_unmeasured_share: of the surface that should have been measured.
+      most_missing_share: of the surface that should have been measured within the region that was.
       most_noise: standard deviation of the inliers' deviations, of the part's radius; above it
         the pose is rejected.
       doubtful_noise: likewise; above it no pose is certain, since a sensor that is off by so much
@@ -38,7 +38,7 @@ class Limits:
 
     least_inlier_share: float = 0.6
     most_violation_share: float = 0.12
-    most_unmeasured_share: float = 0.35
+    most_missing_share: float = 0.35
     most_noise: float = 0.04
     doubtful_noise: float = 0.02
     least_support: float = 0.7
@@ -139,10 +139,10 @@ def _faults(verification: Verification, radius_mm: float, limits: Limits) -> Ite
             f"{verification.violation_share:.0%} of the points would have been seen through "
             "the part's material"
         )
-    if verification.unmeasured_share > limits.most_unmeasured_share:
+    if verification.missing_share > limits.most_missing_share:
         yield (
-            f"{verification.unmeasured_share:.0%} of the surface that the sensor should have "
-            "seen was not measured"
+            f"{verification.missing_share:.0%} of the surface that the sensor should have seen "
+            "between the measured points was not measured"
         )
     noise = verification.tolerance_mm / 3
     if noise > limits.most_noise * radius_mm:

@@ -33,22 +33,29 @@ class Evidence:
     Attributes:
       patch: [P] number of points in each patch.
       score: [H, P] sums over points and empty cells.
-      total: [H] sum of all, per point.
+      cropped: [H, P] likewise, if what is outside the measured region was cut off: then it is not
+        known, and does not count.
+      total: [H] sum of the means of both, per point: to sort by.
     """
 
     patch: np.ndarray
     score: np.ndarray
+    cropped: np.ndarray
     total: np.ndarray
 
     def preference(self, first: int, second: int) -> float:
         """How many standard errors the patches prefer the first pose to the second.
 
         A paired t statistic over patches. Patches that see no difference say nothing and do not
-        count, so that a small feature which all of its patches agree on is not drowned.
+        count, so that a small feature which all of its patches agree on is not drowned. Whether
+        the scan was cropped or not: of the two figures, the one nearer to the second pose.
         """
-        difference = self.score[first] - self.score[second]
-        spread = np.sqrt(np.sum(difference**2))
-        return float(difference.sum() / spread) if spread > 0 else 0.0
+        return min(_t_statistic(s[first] - s[second]) for s in (self.score, self.cropped))
+
+
+def _t_statistic(difference: np.ndarray) -> float:
+    spread = np.sqrt(np.sum(difference**2))
+    return float(difference.sum() / spread) if spread > 0 else 0.0
 
 
 def evidence(
@@ -68,36 +75,42 @@ def evidence(
     residuals = model.residuals(poses, points, precision="samples")
     point_score = _point_scores(residuals, tolerance_mm, view)
     point_patch = cube_labels(points, CUBES) if view is None else view.patch
-    unmeasured = []  # of each pose, the patches of its empty cells
+    unmeasured = []  # of each pose, the patches of its empty cells, and whether they are inside
     if view is not None:
         for h in range(len(poses.rotation)):
-            _, patch, seen = predicted_unmeasured(model, select(poses, h), view)
-            unmeasured.append(patch[seen])
-    names, row = np.unique(np.concatenate([point_patch, *unmeasured]), return_inverse=True)
-    starts = np.cumsum([len(point_patch), *map(len, unmeasured)])[:-1]
+            _, patch, seen, among = predicted_unmeasured(model, select(poses, h), view)
+            unmeasured.append((patch[seen], among[seen]))
+    patches = [patch for patch, _ in unmeasured]
+    names, row = np.unique(np.concatenate([point_patch, *patches]), return_inverse=True)
+    starts = np.cumsum([len(point_patch), *map(len, patches)])[:-1]
     row_of_point, *rows_of_empty = np.split(row, starts)
-    sums = [np.bincount(row_of_point, s, minlength=len(names)) for s in point_score]
-    for score, empty in zip(sums, rows_of_empty, strict=False):  # no empty cells without a view
+    score = np.stack([np.bincount(row_of_point, s, minlength=len(names)) for s in point_score])
+    cropped = score.copy()
+    for h, rows in enumerate(rows_of_empty):
         lost = UNMEASURED_PENALTY * view.points_per_cell
-        score -= lost * np.bincount(empty, minlength=len(names))
-    score = np.stack(sums)
+        score[h] -= lost * np.bincount(rows, minlength=len(names))
+        cropped[h] -= lost * np.bincount(rows[unmeasured[h][1]], minlength=len(names))
     count = np.bincount(row_of_point, minlength=len(names))
-    return Evidence(patch=count, score=score, total=score.sum(axis=1) / len(points))
+    total = 0.5 * (score + cropped).sum(axis=1) / len(points)
+    return Evidence(count, score, cropped, total)
 
 
 def predicted_unmeasured(
     model: RayCasting, pose: RigidTransform, view: View
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rays through empty cells [m, 3], their patches [m], and whether they should have measured."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rays through empty cells [m, 3], their patches [m], and two [m] bool.
+
+    Whether they should have measured the part, and whether they are among those that measured.
+    """
     center = pose.inverse().apply(model.part.center[None])[0]
-    rays, patch = view.empty_cells(center, model.part.radius)
+    rays, patch, among = view.empty_cells(center, model.part.radius)
     if not len(rays):
-        return rays, patch, np.zeros(0, bool)
+        return rays, patch, np.zeros(0, bool), among
     sensor = pose.apply(view.sensor_origin[None])
     directions = pose.rotate(rays)
     hits = model.scanner.cast(np.broadcast_to(sensor, rays.shape), directions)
     cosine = -np.sum(hits.normals * directions, axis=1)
-    return rays, patch, (hits.face >= 0) & (cosine > FLATTEST_COSINE)
+    return rays, patch, (hits.face >= 0) & (cosine > FLATTEST_COSINE), among
 
 
 def verify(
@@ -118,18 +131,21 @@ def verify(
     # a ray that just misses an edge belongs to it
     status[np.abs(deviation) <= tolerance_mm] = PointStatus.INLIER
     inlier = status == PointStatus.INLIER
-    unmeasured = violation = np.nan
+    unmeasured = missing = violation = np.nan
     score = _point_scores(residuals, tolerance_mm, view).sum()
     if view is not None:
         violation = float(np.mean(status == PointStatus.BEHIND))
-        _, _, seen = predicted_unmeasured(model, part_from_camera, view)
+        _, _, seen, among = predicted_unmeasured(model, part_from_camera, view)
         measured = inlier.sum() / view.points_per_cell
         unmeasured = float(seen.sum() / max(seen.sum() + measured, 1.0))
+        inside = float((seen & among).sum())
+        missing = inside / max(inside + measured, 1.0)
         score -= UNMEASURED_PENALTY * view.points_per_cell * seen.sum()
     return Verification(
         inlier_share=float(inlier.mean()),
         violation_share=violation,
         unmeasured_share=unmeasured,
+        missing_share=missing,
         tolerance_mm=tolerance_mm,
         checked=checked,
         status=status,
