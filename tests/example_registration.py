@@ -89,6 +89,7 @@ def example_registration(status: str = "accepted") -> Registration:
             inlier_share=share[PointStatus.INLIER],
             violation_share=share[PointStatus.BEHIND],
             unmeasured_share=0.031,
+            missing_share=0.031,
             tolerance_mm=TOLERANCE_MM,
             checked=np.arange(len(points)),
             status=point_status,

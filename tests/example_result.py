@@ -51,6 +51,7 @@ def example_result(status: str = "accepted", *, sensor: bool = True) -> pose_res
             inlier_share=0.75,
             violation_share=0.125 if sensor else np.nan,
             unmeasured_share=0.031 if sensor else np.nan,
+            missing_share=0.031 if sensor else np.nan,
             tolerance_mm=0.31,
             checked=np.arange(8),
             status=points,

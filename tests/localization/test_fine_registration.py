@@ -280,47 +280,6 @@ def test_errors_that_go_together_widen_the_covariance(fine):
     assert np.mean(errors) < 4 * 6
 
 
-# --- stock on the casting ------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_an_offset_that_is_not_there_costs_the_pose_little(fine):
-    points, truth = fine
-    errors, offsets = [], []
-    for seed in range(6):
-        noisy = with_noise(points, 0.1, 200 + seed)
-        init = disturbed(vane(), truth, 2, 2, seed)
-        found = refine(model(vane()), noisy, init, max_allowance_mm=1.0)
-        errors.append(squared_error(vane(), found.part_from_camera, truth, found.information))
-        offsets.append(found.allowance_mm / found.allowance_sigma_mm)
-    plain = refine(model(vane()), noisy, init)
-    # the covariance is honest, of the pose and of the offset: chi-square
-    assert np.sum(errors) < 1.15 * chi2.ppf(0.999, 36)
-    assert np.sum(np.square(offsets)) < 1.15 * chi2.ppf(0.999, 6)
-    # not to know the offset takes information away, in no direction gives any
-    lost = np.linalg.eigvals(np.linalg.solve(plain.information, found.information)).real
-    assert lost.max() < 1.05
-    assert 0.05 < lost.min() < 0.9
-
-
-def test_where_a_plane_is_all_that_is_seen_the_offset_stays_what_it_was():
-    """Offset and motion along the plane's normal look alike: the prior takes it for a motion."""
-    part = box()
-    pose = look_at(part.center + np.array([0.0, 0.0, 400.0]), part.center)
-    camera_points = pose.apply(
-        np.column_stack([*np.random.default_rng(0).uniform(-8, 8, (2, 2000)), np.zeros(2000)])
-        + part.center
-        + np.array([0.0, 0.0, part.extent_mm[2] / 2 + 0.3])
-    )
-    found = refine(
-        model(part), with_noise(camera_points, 0.05, 0), pose.inverse(), max_allowance_mm=1.0
-    )
-    assert abs(found.allowance_mm) < 0.01
-    assert np.isfinite(found.information).all()
-    # all that is known of the offset is the prior
-    assert found.allowance_sigma_mm == pytest.approx(0.5, rel=0.01)
-
-
 # --- subsets ------------------------------------------------------------------------------------
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from example_result import example_result, pose
 
-from vanejax.localization.pose_result import Verdict
+from vanejax.localization.pose_result import BOUND, FormDeviation, Verdict
 from vanejax.localization.verdict import CompetingHypothesis, Limits, judge
 
 RADIUS = 70.0
@@ -16,12 +16,15 @@ GOOD = example_result()
 FAR = CompetingHypothesis(20.0, 180.0, 0.5, pose((180.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 
 
-def verdict(*, competing=(FAR,), limits=None, uncertainty=None, **verification) -> Verdict:
+def verdict(
+    *, competing=(FAR,), limits=None, uncertainty=None, form=None, **verification
+) -> Verdict:
     """Of a result in which all is well but what is given."""
     said = {
         "inlier_share": 0.95,
         "violation_share": 0.01,
         "unmeasured_share": 0.03,
+        "missing_share": 0.03,
         "tolerance_mm": 0.3,
         "checked": np.arange(1000),
     }
@@ -30,6 +33,7 @@ def verdict(*, competing=(FAR,), limits=None, uncertainty=None, **verification) 
         dataclasses.replace(GOOD.uncertainty, **(uncertainty or {})),
         competing,
         radius_mm=RADIUS,
+        form=form,
         limits=limits,
     )
 
@@ -46,8 +50,8 @@ REJECTED = {
     "only 30 points": {"checked": np.arange(32)},
     "only 40% of the points lie on the part (within 0.3 mm)": {"inlier_share": 0.4},
     "30% of the points would have been seen through the part's material": {"violation_share": 0.3},
-    "50% of the surface that the sensor should have seen was not measured": {
-        "unmeasured_share": 0.5
+    "50% of the surface that the sensor should have seen between the measured points": {
+        "missing_share": 0.5
     },
     "the points lie 3 mm off the surface": {"tolerance_mm": 9.0},
 }
@@ -93,14 +97,14 @@ def test_few_inliers_are_counted_not_shared():
 
 
 def test_the_worst_fault_comes_first():
-    found = verdict(inlier_share=0.1, violation_share=0.5, unmeasured_share=0.9)
+    found = verdict(inlier_share=0.1, violation_share=0.5, missing_share=0.9)
     assert found.reason.startswith("only 10% of the points")
-    assert verdict(violation_share=0.5, unmeasured_share=0.9).reason.startswith("50%")
+    assert verdict(violation_share=0.5, missing_share=0.9).reason.startswith("50%")
 
 
 def test_unknown_shares_do_not_count():
     """Without a sensor there is no violation and nothing unmeasured: NaN, and no fault."""
-    found = verdict(violation_share=np.nan, unmeasured_share=np.nan)
+    found = verdict(violation_share=np.nan, unmeasured_share=np.nan, missing_share=np.nan)
     assert found.status == "accepted"
 
 
@@ -145,16 +149,46 @@ def test_a_weak_direction_is_ambiguous_and_named(axis, words):
     turn = {"weakest_rotation_axis": np.array(axis), "weakest_rotation_sigma_deg": 2.5}
     found = verdict(uncertainty=turn)
     assert found.status == "ambiguous"
-    assert f"about {words}: 2.50 deg" in found.reason
+    assert f"about {words} is known to 4.9 deg only (95 %)" in found.reason
     shift = {"weakest_translation_axis": np.array(axis), "weakest_translation_sigma_mm": 1.25}
     found = verdict(uncertainty=shift)
     assert found.status == "ambiguous"
-    assert f"along {words}: 1.25 mm" in found.reason
+    assert f"along {words} is known to 2.5 mm only (95 %)" in found.reason
     close = {
-        "weakest_rotation_sigma_deg": limits.most_rotation_sigma_deg,
-        "weakest_translation_sigma_mm": limits.most_translation_sigma * RADIUS,
+        "weakest_rotation_sigma_deg": 0.99 * limits.tolerance_deg / BOUND,
+        "weakest_translation_sigma_mm": 0.99 * limits.tolerance_mm / BOUND,
     }
     assert verdict(uncertainty=close).status == "accepted"
+
+
+@pytest.mark.parametrize(
+    ("form", "words"),
+    [
+        ({"is_told": False}, "too little smooth surface was measured"),
+        ({"converged": False}, "did not converge"),
+        ({"unexplained_share": 0.08}, "8% of the surface is not where the CAD model has it"),
+        ({"field": "facing", "field_mm": 0.12}, "offset by some 0.12 mm"),
+        ({"field": "form", "field_mm": 0.31}, "differs from its CAD model by 0.31 mm"),
+    ],
+)
+def test_a_form_that_no_model_explains_is_ambiguous(form, words):
+    found = verdict(form=FormDeviation(**form))
+    assert found.status == "ambiguous"
+    assert words in found.reason
+
+
+def test_what_the_part_differs_by_is_named_with_its_figure():
+    form = FormDeviation(stock_mm=0.5041, stock_sigma_mm=0.0012, field="form", field_mm=0.1)
+    found = verdict(form=form)
+    assert found.status == "accepted"
+    assert "stock 0.504 +- 0.001 mm" in found.reason
+    assert "the surface varies by 0.1 mm" in found.reason
+    form = FormDeviation(scale_error=-0.0101, scale_sigma=0.0001, focal_error=0.003)
+    found = verdict(form=form, uncertainty={"weakest_translation_sigma_mm": 2.0})
+    assert found.status == "ambiguous"
+    assert "1.01% +- 0.01% smaller than the CAD model" in found.reason
+    assert "focal length is off by +0.30%" in found.reason
+    assert "check the camera on a gauge" in found.reason
 
 
 @pytest.mark.parametrize(
@@ -162,14 +196,14 @@ def test_a_weak_direction_is_ambiguous_and_named(axis, words):
     [
         (Limits(least_inlier_share=0.99), {}),
         (Limits(most_violation_share=0.001), {}),
-        (Limits(most_unmeasured_share=0.01), {}),
+        (Limits(most_missing_share=0.01), {}),
         (Limits(most_noise=0.001), {}),
         (Limits(doubtful_noise=0.001), {}),
         (Limits(doubtful_noise=0.03), {"tolerance_mm": 3 * 0.025 * RADIUS}),
         (Limits(least_inliers=2000), {}),
         (Limits(least_preference=30.0), {}),
-        (Limits(most_rotation_sigma_deg=1e-4), {}),
-        (Limits(most_translation_sigma=1e-6), {}),
+        (Limits(tolerance_deg=1e-3), {}),
+        (Limits(tolerance_mm=1e-3), {}),
         (Limits(least_support=0.99), {}),
         (Limits(least_support=0.5), {"inlier_share": 0.62}),
         (Limits(least_inlier_share=0.2, least_support=0.2), {"inlier_share": 0.3}),

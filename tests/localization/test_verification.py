@@ -202,7 +202,7 @@ def test_surface_seen_too_flat_may_be_missing(flat_deg, missing):
 def test_rays_to_unmeasured_surface_hit_it(seen):
     points, truth = seen
     half = points[points[:, 0] < np.median(points[:, 0])]
-    rays, patch, missing = predicted_unmeasured(model(vane()), truth, View(half, ORIGIN))
+    rays, patch, missing, _ = predicted_unmeasured(model(vane()), truth, View(half, ORIGIN))
     assert rays.shape == (len(patch), 3)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, atol=1e-12)
     hits = model(vane()).scanner.cast(
@@ -222,7 +222,7 @@ def test_rays_to_unmeasured_surface_hit_it(seen):
 def test_no_empty_cell_lies_on_a_measured_point(seen):
     points, _ = seen
     view = View(points, ORIGIN)
-    rays, _ = view.empty_cells(points.mean(axis=0), vane().radius)
+    rays, _, _ = view.empty_cells(points.mean(axis=0), vane().radius)
     assert len(rays) > 100
     # the ray through the middle of an empty cell is half a cell and more from any measured one
     image = points[:, :2] / -points[:, 2:]

@@ -112,7 +112,7 @@ class View:
 
 
 def _hull(cells: np.ndarray) -> np.ndarray:
-    """[k, 3] (a, b, c): a point (x, y) is within the convex hull where all ``a x + b y + c < 0``."""
+    """[k, 3] (a, b, c): (x, y) is within the convex hull where all ``a x + b y + c < 0``."""
     try:
         return ConvexHull(np.unique(cells, axis=0)).equations
     except QhullError:  # all in one line

@@ -154,8 +154,8 @@ def _slippable_screws(points: np.ndarray, normals: np.ndarray) -> list[np.ndarra
     screws = []
     for start in eigh(columns.T @ columns, way)[1].T:
         screw = start
-        for _ in range(20):
-            weight = 1 / (1 + (_slip(points, normals, screw) / SLIP) ** 2) ** 2
+        for width in np.geomspace(0.2, SLIP / 2, 24):  # narrower and narrower, to one set of faces
+            weight = 1 / (1 + (_slip(points, normals, screw) / width) ** 2) ** 2
             screw = eigh((columns * weight[:, None]).T @ columns, way)[1][:, 0]
         share = np.mean(_slip(points, normals, screw) < SLIP)
         alike = [min(np.linalg.norm(screw - s), np.linalg.norm(screw + s)) for _, s in screws]

@@ -33,7 +33,7 @@ class Limits:
         weakest directions, are to be within.
       most_field_mm: standard deviation of a smooth deviation of form; above it no pose is certain,
         since a deviation that large is seldom random: it is stock on one side, or a bend.
-      most_unexplained_share: of the scan's patches, those that no model of the part's form explains.
+      most_unexplained_share: of the scan's patches, those that no model of its form explains.
     """
 
     least_inlier_share: float = 0.6
@@ -199,18 +199,18 @@ def _doubts_of_form(form: FormDeviation | None, limits: Limits) -> Iterator[str]
         )
     if form.unexplained_share > limits.most_unexplained_share:
         yield (
-            f"{form.unexplained_share:.0%} of the surface is not where the CAD model has it, and no "
-            "smooth deviation explains that: missing or extra material, or another part"
+            f"{form.unexplained_share:.0%} of the surface is not where the CAD model has it, and "
+            "no smooth deviation explains that: missing or extra material, or another part"
         )
     if form.field == "facing":
         yield (
-            f"faces that look in different directions are offset by some {form.field_mm:.2g} mm, as "
-            "by stock on a few faces only: the pose may be off by as much"
+            f"faces that look in different directions are offset by some {form.field_mm:.2g} mm, "
+            "as by stock on a few faces only: the pose may be off by as much"
         )
     elif form.field_mm > limits.most_field_mm:
         yield (
-            f"the part differs from its CAD model by {form.field_mm:.2g} mm: so much is seldom random, "
-            "and the pose may be off by as much"
+            f"the part differs from its CAD model by {form.field_mm:.2g} mm: so much is seldom "
+            "random, and the pose may be off by as much"
         )
     if not form.converged:
         yield (

@@ -47,10 +47,11 @@ class Evidence:
         """How many standard errors the patches prefer the first pose to the second.
 
         A paired t statistic over patches. Patches that see no difference say nothing and do not
-        count, so that a small feature which all of its patches agree on is not drowned. Whether
-        the scan was cropped or not: of the two figures, the one nearer to the second pose.
+        count, so that a small feature which all of its patches agree on is not drowned. It holds
+        whether the scan was cropped or not: the smaller of the two figures, 0 where they disagree.
         """
-        return min(_t_statistic(s[first] - s[second]) for s in (self.score, self.cropped))
+        whole, cropped = (_t_statistic(s[first] - s[second]) for s in (self.score, self.cropped))
+        return min(whole, cropped, key=abs) if whole * cropped > 0 else 0.0
 
 
 def _t_statistic(difference: np.ndarray) -> float:
