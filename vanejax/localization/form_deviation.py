@@ -149,7 +149,7 @@ class _Fit:
                 before, margin = margin, float(np.clip(1.5 * size, *MARGINS_MM))
                 motion = average.mean[:6]
                 squared = motion @ np.linalg.solve(average.covariance[:6, :6], motion)
-                converged = squared < CONVERGED**2 * 6 and margin > 0.7 * before
+                converged = bool(squared < CONVERGED**2 * 6 and margin > 0.7 * before)
                 if converged:
                     break
         return state, average, converged

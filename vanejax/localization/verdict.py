@@ -229,8 +229,8 @@ def _doubts_of_bounds(
             "a single view does not tell a part of another size from a camera with a wrong scale: "
             "check the camera on a gauge, and the unit"
         )
-    elif form is not None and form.field != "none":
-        help_ += ", or a tighter casting"
+    elif form is not None and form.is_as_designed:
+        help_ += ", or to know that the part has no stock (--max-allowance-mm 0)"
     deg, mm = uncertainty.rotation_bound_deg, uncertainty.translation_bound_mm
     if deg > limits.tolerance_deg:
         yield (

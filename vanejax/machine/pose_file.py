@@ -5,6 +5,7 @@ Frames and units are stated in the file itself. Host numpy only.
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import importlib.metadata
 import json
