@@ -24,7 +24,7 @@ from vanejax.localization.residuals import MeasurementModel, RayCasting, Residua
 from vanejax.rigid import RigidTransform
 
 POINTS = 20_000
-PATCHES = 220
+PATCHES = 160
 SURFACE_POINTS = 200
 LEAST_PATCHES, LEAST_POINTS = 20, 3  # points of each patch
 CONVERGED = 0.05  # standard deviations of the pose

@@ -169,7 +169,9 @@ def _register_from_sensor(scan: MeasuredScan, task: _Task) -> PoseResult:
     merged = dataclasses.replace(scan, sensor_origin=None)
     without_weights = dataclasses.replace(task, weights=None)
     other = _register_points(merged, without_weights, SEARCH_ROTATIONS[:1])
-    if other.verdict.status == "rejected":
+    noise_mm = other.verification.tolerance_mm / 3
+    fits = noise_mm <= task.limits.doubtful_noise * task.part.radius
+    if other.verdict.status == "rejected" or not fits:
         return result
     verdict = Verdict(
         "ambiguous",

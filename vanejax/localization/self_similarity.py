@@ -27,15 +27,15 @@ TURNS_DEG = (
     *(sign * turn for turn in (120, 90, 72, 60, 45, 36, 30, 20, 15) for sign in (1, -1)),
 )
 SHIFTS = (-0.25, -0.125, 0.125, 0.25)  # of the length along each principal axis
-POINTS, SCREENED = 800, 300
-ITERATIONS = (5, 12)
+POINTS, SCREENED = 500, 200
+ITERATIONS = (5, 8)
 MOST = 32
 TOLERANCE = 0.02  # of the radius
 LEAST_TURN_DEG, LEAST_SHIFT = 15.0, 0.15  # of the radius: what is nearer is no motion
 # slippable motions
 SLIDES, LEAST_SLIPPING = 3, 0.3  # how many; share of the surface that stays in itself
 SLIP = 0.05  # of a point's way: what goes along the normal, where it counts as slipping
-STEPS, PEAKS = 161, 6
+STEPS, PEAKS = 121, 6
 STILL = RigidTransform(np.eye(3), np.zeros(3))
 
 
@@ -51,13 +51,12 @@ def self_similar_motions(part: Part) -> RigidTransform:
     motions, _ = robust_gauss_newton(
         model, _turns_and_shifts(surface), sample[:SCREENED], iterations=ITERATIONS[0]
     )
-    motions = _best(model, motions, sample, 2 * MOST)
+    motions = _best(model, motions, sample[:SCREENED], MOST)
     motions, _ = robust_gauss_newton(
         model,
         motions,
         sample,
         iterations=ITERATIONS[1],
-        precision="samples",
         # half of the part may be off itself: no kernel as wide as the residuals
         ceiling_mm=0.01 * part.radius,
         min_step_deg=0.1,
