@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from vanejax.errors import InputError
 from vanejax.localization.calibration import Calibration
-from vanejax.localization.fine_registration import subset
+from vanejax.localization.fine_registration import robust_gauss_newton, subset
 from vanejax.localization.noise import LEAST_COSINE, fit_noise
 from vanejax.localization.pose_batch import select, stack
 from vanejax.localization.pose_result import FormDeviation, Refinement
@@ -27,7 +27,7 @@ POINTS = 20_000
 PATCHES = 160
 SURFACE_POINTS = 200
 LEAST_PATCHES, LEAST_POINTS = 20, 3  # points of each patch
-CONVERGED = 0.05  # standard deviations of the pose
+CONVERGED = 0.25  # standard deviations of the pose: outliers come and go by less
 # mm, and of the part's radius: what is farther off is not on the part
 MOST_DEVIATION_MM, MOST_DEVIATION = 2.0, 0.03
 # patches keep this far from edges, and 1.5 times as far as the surface is off
@@ -37,10 +37,14 @@ FLATTEST = 0.1  # cosine of incidence
 NEAR = 4.0  # standard deviations within a patch
 MOST_STEP_DEG, MOST_STEP = 2.0, 0.03  # an iteration turns and moves by no more (of the radius)
 STOCK_ITERATIONS = 2  # the face under the stock is not quite where the ray through it ends
+# other starts, and how large a field must be to try them
+STOCK_GUESSES_MM, CLEAR_MM = (0.7,), 0.25
 LIKELY = 0.5  # a term more probable than this is taken to be there
 # how many times more than elsewhere all points may know in a direction than those on smooth faces:
 # what is beyond comes from edges, which a casting has elsewhere
 MOST_BY_EDGES = 30.0
+# of the stock: how well the points under it are known where the surface is curved
+STOCK_TRUENESS = 0.005
 # of scale times distance: a scan does not tell a large part from a camera with a wrong scale, which
 # would move the pose along the line of sight by that much; the bounds at 1.96 sigma hold for both
 SCALE_SIGMA = 0.6
@@ -110,6 +114,13 @@ def with_form_deviation(
     fit = _Fit(model, sample, calibration)
     with threadpool_limits(1):  # the matrices are small: threads would wait for each other
         estimate = fit.converge(_State(refinement.part_from_camera, np.zeros(3)), prior)
+        # least squares may have locked onto a few faces of a casting with much stock
+        for stock_mm in () if prior.stock_mm == 0 else STOCK_GUESSES_MM:
+            if estimate is None or _is_clear(*estimate[1:]):
+                break
+            other = fit.converge(fit.start(refinement.part_from_camera, stock_mm), prior)
+            if other is not None and _is_clear(*other[1:]):
+                estimate = other
     if estimate is None:
         return dataclasses.replace(refinement, form=FormDeviation(is_told=False))
     if max_allowance_mm:
@@ -121,6 +132,11 @@ def with_form_deviation(
     return _result(model, refinement, *estimate, calibrated=calibration is not None)
 
 
+def _is_clear(average: Average, converged: bool) -> bool:
+    """Whether an estimate says what the part differs by, without a large rest."""
+    return converged and average.field.kind != "facing" and average.amplitude_mm <= CLEAR_MM
+
+
 class _Fit:
     """The estimation of one scan of one part."""
 
@@ -130,6 +146,15 @@ class _Fit:
         self.model, self.points = model, points
         self.moves = None if calibration is None else calibration.displacements(points)
 
+    def start(self, pose: RigidTransform, stock_mm: float) -> _State:
+        """A pose near one for a part with that much stock."""
+        terms = np.array([stock_mm, 0.0, 0.0])
+        for _ in range(2):
+            model, points = as_designed(self.model, self.points, pose, terms)
+            poses, _ = robust_gauss_newton(model, stack(pose), points[::5], iterations=8)
+            pose = select(poses, 0)
+        return _State(pose, terms)
+
     def converge(self, state: _State, prior: Prior) -> tuple[_State, Average, bool] | None:
         """From a state to that at which the average over all models stays; None: too few patches.
 
@@ -137,7 +162,7 @@ class _Fit:
         """
         margin, average, converged = MARGINS_MM[1], None, False
         # far from the solution a rich model explains points of another face
-        for kinds, most in ((("form",), 3), (prior.kinds[:-1], 6), (prior.kinds, 6)):
+        for kinds, most in ((("form",), 3), (prior.kinds[:-1], 5), (prior.kinds, 4)):
             stage = dataclasses.replace(prior, kinds=kinds)
             for _ in range(most):
                 patches, size = self._patches(state, margin)
@@ -379,6 +404,9 @@ def _result(
         return dataclasses.replace(refinement, form=form)
     pose = scaled_pose(state.pose, model.part.center, state.factor)
     covariance = average.covariance[:6, :6].copy()
+    if stock:
+        by_stock = average.covariance[:6, 6] / average.covariance[6, 6]
+        covariance += (STOCK_TRUENESS * stock) ** 2 * np.outer(by_stock, by_stock)
     if scale and isinstance(model, RayCasting):
         in_camera = pose.inverse().apply(model.part.center[None])[0] - model.sensor_origin
         sight = SCALE_SIGMA * scale * (pose.rotation @ in_camera)
