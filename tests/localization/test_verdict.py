@@ -161,16 +161,23 @@ def test_a_weak_direction_is_ambiguous_and_named(axis, words):
     assert verdict(uncertainty=close).status == "accepted"
 
 
-@pytest.mark.parametrize(
-    ("form", "words"),
-    [
-        ({"is_told": False}, "too little smooth surface was measured"),
-        ({"converged": False}, "did not converge"),
-        ({"unexplained_share": 0.08}, "8% of the surface is not where the CAD model has it"),
-        ({"field": "facing", "field_mm": 0.12}, "offset by some 0.12 mm"),
-        ({"field": "form", "field_mm": 0.31}, "differs from its CAD model by 0.31 mm"),
-    ],
-)
+FORMS = [
+    {"is_told": False},
+    {"converged": False},
+    {"unexplained_share": 0.08},
+    {"field": "facing", "field_mm": 0.12},
+    {"field": "form", "field_mm": 0.31},
+]
+WORDS = [
+    "too little smooth surface was measured",
+    "did not converge",
+    "8% of the surface is not where the CAD model has it",
+    "offset by some 0.12 mm",
+    "differs from its CAD model by 0.31 mm",
+]
+
+
+@pytest.mark.parametrize(("form", "words"), zip(FORMS, WORDS, strict=True))
 def test_a_form_that_no_model_explains_is_ambiguous(form, words):
     found = verdict(form=FormDeviation(**form))
     assert found.status == "ambiguous"

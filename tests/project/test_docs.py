@@ -34,6 +34,7 @@ from vanejax.cli.program import main, make_parser
 from vanejax.cli.register import EXIT_CODES
 from vanejax.errors import InputError
 from vanejax.localization import clutter_removal
+from vanejax.localization.pose_result import FormDeviation
 from vanejax.localization.verdict import CompetingHypothesis
 
 ROOT = Path(__file__).parents[2]
@@ -408,6 +409,7 @@ def test_every_reason_of_the_verdict_has_its_line() -> None:
         test_verdict.verdict(tolerance_mm=3 * 0.03 * test_verdict.RADIUS),
         test_verdict.verdict(uncertainty={"weakest_rotation_sigma_deg": 2.0}),
         test_verdict.verdict(uncertainty={"weakest_translation_sigma_mm": 2.0}),
+        *(test_verdict.verdict(form=FormDeviation(**form)) for form in test_verdict.FORMS),
         *(test_verdict.verdict(**changes) for changes in test_verdict.REJECTED.values()),
     ]
     used = set()
@@ -419,7 +421,8 @@ def test_every_reason_of_the_verdict_has_its_line() -> None:
         ]
         assert len(rows) == 1, f"{verdict.status}: {verdict.reason}"
         used.add(rows[0])
-    (left,) = set(reasons()) - used  # the one that is not said of a pose alone
+    moved, left = sorted(set(reasons()) - used)  # those that are not said of a pose alone
+    assert moved[1].startswith("seen from the scan's origin")
     tree = ast.parse(Path(clutter_removal.__file__).read_text())
     templates = [
         "".join(p.value if isinstance(p, ast.Constant) else "…%" for p in text.values)
