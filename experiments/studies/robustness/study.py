@@ -32,6 +32,7 @@ from experiments.studies.verdicts.report import verdict_counts
 from vanejax.cad import Part, guide_vane
 from vanejax.errors import InputError
 from vanejax.localization import measurement_model, refine, register
+from vanejax.localization.form_deviation import with_form_deviation
 from vanejax.localization.matched_poses import match_poses
 from vanejax.localization.pose_batch import select, stack
 from vanejax.plotting import save_figure
@@ -75,7 +76,11 @@ class Trial:
             poses = match_poses(matcher, cloud, stack(init), iterations=matcher.iterations)
             matched = select(poses, 0)
             middle = time.perf_counter()
-            fine = refine(self._model, scan.points, matched, max_allowance_mm=max_allowance_mm)
+            fine = refine(self._model, scan.points, matched)
+            if max_allowance_mm:
+                fine = with_form_deviation(
+                    self._model, scan.points, fine, max_allowance_mm=max_allowance_mm
+                )
             end = time.perf_counter()
             row[name] = {
                 "alone": self._errors(scan, matched) | {"time_s": middle - began},
