@@ -14,6 +14,7 @@ from example_scans import (
     measured_points,
     model,
     pose_error,
+    random_view,
     small_motion,
     vane,
     with_noise,
@@ -186,6 +187,22 @@ def test_it_works_without_the_sensors_place():
     assert found.form.stock_mm == pytest.approx(0.5, abs=0.15)
     before, after = (pose_error(vane(), r.part_from_camera, truth)[1] for r in (plain, found))
     assert after < 0.5 * before
+
+
+def test_stock_on_one_side_shows_beyond_the_edges():
+    """All that is seen of three faces of a box looks moved; the far edges are where it shows."""
+    vertices = np.asarray(box().mesh.vertices).copy()
+    vertices[vertices[:, 2] > box().center[2], 2] += 1.0
+    stocked = part_from_mesh(vertices, np.asarray(box().mesh.faces), name="with stock on top")
+    view = random_view(box(), 1)
+    shares = []
+    for part in (box(), stocked):
+        points = Scanner(part).scan(MIDDLE, view).points.astype(np.float64)
+        plain = refine(model(box()), with_noise(points, 0.02, 0), view.inverse())
+        found = with_form_deviation(model(box()), with_noise(points, 0.02, 0), plain)
+        shares.append(found.form.beyond_edges_share)
+    assert shares[0] < 1e-3
+    assert shares[1] > 5e-3
 
 
 @pytest.mark.parametrize(

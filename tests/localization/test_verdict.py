@@ -165,6 +165,7 @@ FORMS = [
     {"is_told": False},
     {"converged": False},
     {"unexplained_share": 0.08},
+    {"beyond_edges_share": 0.012},
     {"field": "facing", "field_mm": 0.12},
     {"field": "form", "field_mm": 0.31},
 ]
@@ -172,6 +173,7 @@ WORDS = [
     "too little smooth surface was measured",
     "did not converge",
     "8% of the surface is not where the CAD model has it",
+    "1.2% of the points lie beyond the part's edges",
     "offset by some 0.12 mm",
     "differs from its CAD model by 0.31 mm",
 ]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 from vanejax.errors import InputError
@@ -43,6 +44,7 @@ LIKELY = 0.5  # a term more probable than this is taken to be there
 # how many times more than elsewhere all points may know in a direction than those on smooth faces:
 # what is beyond comes from edges, which a casting has elsewhere
 MOST_BY_EDGES = 30.0
+BEYOND_MM = 3.0
 # of the stock: how well the points under it are known where the surface is curved
 STOCK_TRUENESS = 0.005
 # of scale times distance: a scan does not tell a large part from a camera with a wrong scale, which
@@ -129,7 +131,11 @@ def with_form_deviation(
             prior = dataclasses.replace(prior, stock_mm=float(np.clip(stock, 0, max_allowance_mm)))
             with threadpool_limits(1):
                 estimate = fit.converge(estimate[0], prior) or estimate
-    return _result(model, refinement, *estimate, calibrated=calibration is not None)
+    result = _result(model, refinement, *estimate, calibrated=calibration is not None)
+    beyond = fit.beyond_edges(estimate[0], refinement.noise_mm, len(points))
+    return dataclasses.replace(
+        result, form=dataclasses.replace(result.form, beyond_edges_share=beyond)
+    )
 
 
 def _is_clear(average: Average, converged: bool) -> bool:
@@ -178,6 +184,20 @@ class _Fit:
                 if converged:
                     break
         return state, average, converged
+
+    def beyond_edges(self, state: _State, noise_mm: float, count: int) -> float:
+        """Share of the points beside the part, by more than their spacing and noise let them be.
+
+        By no more than `BEYOND_MM` either: what is farther off is clutter. ``count`` is of the
+        whole scan. Stock on one side shows here, where all that is seen of the faces looks moved.
+        """
+        model, points = as_designed(self.model, self.points, state.pose, state.terms)
+        residuals = model.residuals(stack(state.pose), points)
+        near = cKDTree(points).query(points[::10], k=2)[0][:, 1]
+        spacing_mm = np.median(near) * np.sqrt(len(points) / count)
+        off_mm = residuals.deviation_mm[0][~residuals.hit[0]]
+        beyond = (off_mm > max(spacing_mm / 2, 5 * noise_mm)) & (off_mm < BEYOND_MM)
+        return float(np.count_nonzero(beyond) / len(points))
 
     def _patches(self, state: _State, margin_mm: float) -> tuple[Patches | None, float]:
         """Means over patches of smooth surface, and how far off the surface most of the points are.

@@ -91,6 +91,7 @@ class FormDeviation:
       field_mm: its standard deviation.
       field_length_mm: over which it is smooth.
       unexplained_share: of the patches of the scan, those that nothing explains.
+      beyond_edges_share: of the points, those that lie clearly beyond the part's edges, a little.
       converged: whether the estimate stayed the same in the end.
       is_told: whether there was enough smooth surface to tell.
     """
@@ -105,6 +106,7 @@ class FormDeviation:
     field_mm: float = 0.0
     field_length_mm: float = 0.0
     unexplained_share: float = 0.0
+    beyond_edges_share: float = 0.0
     converged: bool = True
     is_told: bool = True
 

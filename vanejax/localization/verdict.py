@@ -33,6 +33,7 @@ class Limits:
         weakest directions, are to be within.
       most_field_mm: standard deviation of a smooth deviation of form; above it no pose is certain,
         since a deviation that large is seldom random: it is stock on one side, or a bend.
+      most_beyond_edges_share: of the points, those that lie beyond the part's edges.
       most_unexplained_share: of the scan's patches, those that no model of its form explains.
     """
 
@@ -47,6 +48,7 @@ class Limits:
     tolerance_deg: float = 0.5
     tolerance_mm: float = 1.0
     most_field_mm: float = 0.25
+    most_beyond_edges_share: float = 0.003
     most_unexplained_share: float = 0.05
 
 
@@ -201,6 +203,13 @@ def _doubts_of_form(form: FormDeviation | None, limits: Limits) -> Iterator[str]
         yield (
             f"{form.unexplained_share:.0%} of the surface is not where the CAD model has it, and "
             "no smooth deviation explains that: missing or extra material, or another part"
+        )
+    # stock and size move all edges, as they should
+    moved = form.stock_mm or form.scale_error
+    if form.beyond_edges_share > limits.most_beyond_edges_share and not moved:
+        yield (
+            f"{form.beyond_edges_share:.1%} of the points lie beyond the part's edges: it may have "
+            "stock on one side, which moves the pose by as much, or something touches it"
         )
     if form.field == "facing":
         yield (
