@@ -11,6 +11,7 @@ from experiments.pages.reproduction.studies import ROOT
 from experiments.runner.markdown import provenance, text_block, with_blocks
 from experiments.studies.ablation import table as ablation_table
 from experiments.studies.any_pose import study as any_pose
+from experiments.studies.castings import report as castings_report
 from experiments.studies.comparison import table as comparison_table
 from experiments.studies.density import report as density_report
 from experiments.studies.fine import study as fine
@@ -68,6 +69,7 @@ BLOCKS: dict[str, tuple[str, Callable[[Any], str]]] = {
     "fine": ("fine", _text(lambda report: fine.table(report["levels"]))),
     "verdicts": ("verdicts", _text(verdict_report.table)),
     "any pose": ("any_pose", _text(any_pose.table)),
+    "castings": ("castings", castings_report.table),
     "real scans": ("real_scans", _text(real_scans.table)),
     "known sensor": ("real_scans", real_scans.sensor_table),
     "table": ("sensor_fit", sensor_fit.table),
