@@ -13,9 +13,8 @@ import numpy as np
 from manifold3d import Manifold, Mesh64
 
 from experiments.runner.vane_views import with_noise
-from experiments.studies.verdicts.challenge_parts import ChallengePart
+from experiments.studies.verdicts.challenge_parts import VANE, ChallengePart, challenge_parts
 from experiments.studies.verdicts.depth_camera import random_pose
-from experiments.studies.verdicts.wrong_poses import VANE, parts_to_pose
 from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.rigid import RigidTransform
@@ -105,7 +104,7 @@ class Case:
 @functools.cache
 def sought(name: str) -> ChallengePart:
     """The part of a name, one of `PARTS`."""
-    return parts_to_pose([name])[name]
+    return challenge_parts([name])[name]
 
 
 def make_case(name: str, kind: str, number: int, seed: int) -> Case:
