@@ -29,6 +29,7 @@ QUARTET = GuideVaneSegment(
     vanes=4, vanes_per_ring=50, inner_radius_mm=255.0, outer_radius_mm=298.0, slot_width_mm=5.0
 )
 # and by how many pitches some of the vanes fall onto their neighbours
+OFF_AXIS_MM = 0.5
 VANES = {VANE: (DOUBLET, (-1, 1)), "vane_4": (QUARTET, (-2, -1, 1, 2))}
 
 
@@ -119,11 +120,25 @@ def _placed(name: str) -> ChallengePart:
 def _vanes(segment: GuideVaneSegment, pitches: tuple[int, ...]) -> ChallengePart:
     """Guide vanes; so many pitches on, some of them fall onto their neighbours."""
     part = guide_vane(segment)
-    # the module's frame: x downstream along the engine's axis, z radially out, centred
-    middle = segment.inner_radius_mm + 0.5 * part.extent_mm[2]
     angles = np.degrees(segment.pitch_rad) * np.array(pitches)
-    also = [rotation_about(X, angle, np.array([0.0, 0.0, -middle])) for angle in angles]
+    also = [rotation_about(Z, angle, _engine_axis(part)) for angle in angles]
     return ChallengePart(part=part, symmetries=ONLY_IDENTITY, also_tried=np.stack(also))
+
+
+def _engine_axis(part: Part) -> np.ndarray:
+    """[3] a point of the engine's axis, which is along z: normals of the platforms meet there."""
+    mesh = part.mesh
+    normals, middles = np.asarray(mesh.face_normals), np.asarray(mesh.triangles_center)
+    platform = (np.abs(normals[:, 2]) < 1e-3) & (np.abs(normals[:, 1]) > 0.95)
+    across = normals[platform, :2] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    along = np.sum(across * middles[platform, :2], axis=1)
+    weight = np.asarray(mesh.area_faces)[platform]
+    for _ in range(20):  # fillets and vanes point elsewhere
+        product = across.T @ (across * weight[:, None])
+        point = np.linalg.solve(product, across.T @ (along * weight))
+        off = across @ point - along
+        weight = np.asarray(mesh.area_faces)[platform] / (1 + (off / OFF_AXIS_MM) ** 2)
+    return np.array([*point, 0.0])
 
 
 def _designs() -> dict[str, Callable[[], Design]]:
