@@ -23,6 +23,7 @@ from experiments.pages.reproduction.live import Live, against_evaluation, agains
 from experiments.pages.reproduction.studies import BY_RECORD, Outcome
 from experiments.runner.markdown import folded, machine_of, provenance, slug, table
 from experiments.studies.ablation import picture as ablation_picture
+from experiments.studies.castings import report as castings_report
 from experiments.studies.comparison import pictures as comparison_pictures
 from experiments.studies.density import report as density_report
 from experiments.studies.fine import study as fine
@@ -50,6 +51,7 @@ PICTURES: dict[str, Callable[[Any], Figure]] = {
     "position": position_report.picture,
     "fine": lambda report: fine.picture(report["levels"]),
     "verdicts": verdict_report.picture,
+    "castings": castings_report.picture,
 }
 
 

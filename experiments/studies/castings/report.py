@@ -93,9 +93,9 @@ def _lines(report: Report) -> Iterable[list[str]]:
             *(str(summary[name]) for name in ("cases", *STATUSES, "accepted_wrong", "listed")),
             _digits(after["covered"]["mean"], "{:.0%}"),
             _digits(summary["covered_accepted"], "{:.0%}"),
-            *(_digits(after["squared"][name], "{:.2f}") for name in ("median", "mean")),
+            *(_digits(after["squared"][name], "{:.3g}") for name in ("median", "mean")),
             *(
-                _digits(stage[name]["median"], "{:.3f}")
+                _digits(stage[name]["median"], "{:.2g}")
                 for stage in (before, after)
                 for name in ("rotation_deg", "translation_mm")
             ),
@@ -132,7 +132,7 @@ def table(report: Report) -> str:
         if after is not None:
             over = BOUND * max(after["rotation_over_bound"], after["translation_over_bound"])
             off = (
-                f"{after['rotation_deg']:.3f} deg and {after['translation_mm']:.3f} mm off, "
+                f"{after['rotation_deg']:.2g} deg and {after['translation_mm']:.2g} mm off, "
                 f"{over:.1f} standard deviations"
             )
         lines.append(
