@@ -303,3 +303,20 @@ def test_the_last_match_is_the_last_of_all_and_shares_what_it_is_given():
     # f32 eps x the condition of 1e3
     np.testing.assert_allclose(found.rotation, expected["rotation"], atol=1e-3)
     np.testing.assert_allclose(found.translation, expected["translation"], atol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axes", [(1, 1, 0), (1, 0, 0), (0, 0, 0)])
+def test_gradients_stay_finite_on_a_plane_a_line_and_a_point(axes):
+    source, target = clouds()
+    flat = source.replace(
+        xyz=source.xyz * np.float32(axes),
+        normals=jnp.broadcast_to(jnp.float32([0, 0, 1]), source.xyz.shape),
+    )
+
+    def total(variables, xyz):
+        match = fast(variables, flat.replace(xyz=xyz), target, RigidTransform.identity())
+        return jnp.sum(match.target_from_source.as_matrix() ** 3)
+
+    gradient = quick_jit(jax.grad(total, (0, 1)))(variables(), flat.xyz)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
