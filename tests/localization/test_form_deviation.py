@@ -146,14 +146,14 @@ def test_too_little_smooth_surface_is_said():
 
 
 def test_one_plane_leaves_what_it_leaves():
-    """Of a box's face alone, edges would fix the rest: of a casting they would be elsewhere."""
+    """Of a box's face alone, edges fix the rest, and of a casting they are a little elsewhere."""
     points, truth = measured_points(box(), camera=MIDDLE, noise_mm=0.02)
     inside = truth.apply(points)
     top = points[inside[:, 2] > inside[:, 2].max() - 0.2]
     plain = refine(model(box()), top, truth)
     found = with_form_deviation(model(box()), top, plain)
     sigma = uncertainty(found, box().center).weakest_translation_sigma_mm
-    assert sigma > 1.0
+    assert 0.2 < sigma < 0.5
 
 
 def test_points_without_stock_and_scale_lie_on_the_part():

@@ -42,8 +42,8 @@ STOCK_ITERATIONS = 2  # the face under the stock is not quite where the ray thro
 STOCK_GUESSES_MM, CLEAR_MM = (0.7,), 0.25
 LIKELY = 0.5  # a term more probable than this is taken to be there
 # how many times more than elsewhere all points may know in a direction than those on smooth faces:
-# what is beyond comes from edges, which a casting has elsewhere
-MOST_BY_EDGES = 30.0
+# what is beyond comes from edges, and of a casting they are that far off
+MOST_BY_EDGES, EDGE_MM = 30.0, 0.4
 BEYOND_MM = 3.0
 # of the stock: how well the points under it are known where the surface is curved
 STOCK_TRUENESS = 0.005
@@ -420,7 +420,11 @@ def _result(
         surfaces = np.linalg.inv(average.covariance[:6, :6])
         fixed_by = np.linalg.eigvals(np.linalg.solve(surfaces, refinement.information)).real
         if fixed_by.max() > MOST_BY_EDGES * np.sort(fixed_by)[1]:
-            refinement = dataclasses.replace(refinement, information=surfaces)
+            edges = np.repeat([EDGE_MM / model.part.radius, EDGE_MM], 3) ** 2
+            edges = np.linalg.pinv(refinement.information, hermitian=True) + np.diag(edges)
+            refinement = dataclasses.replace(
+                refinement, information=surfaces + np.linalg.inv(edges)
+            )
         return dataclasses.replace(refinement, form=form)
     pose = scaled_pose(state.pose, model.part.center, state.factor)
     covariance = average.covariance[:6, :6].copy()
