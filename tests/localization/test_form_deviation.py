@@ -23,7 +23,6 @@ from example_scans import (
 from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cad.part import part_from_mesh
 from vanejax.errors import InputError
-from vanejax.localization.calibration import Calibration
 from vanejax.localization.covariance import uncertainty
 from vanejax.localization.fine_registration import refine
 from vanejax.localization.form_deviation import (
@@ -35,6 +34,7 @@ from vanejax.localization.form_deviation import (
 from vanejax.localization.pose_batch import stack
 from vanejax.localization.pose_result import Refinement
 from vanejax.localization.residuals import SurfaceMatching
+from vanejax.localization.sensor_calibration import Calibration
 from vanejax.rigid import RigidTransform
 from vanejax.scanner import Scanner
 from vanejax.scanner.range_errors import Lens

@@ -15,13 +15,13 @@ from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 from vanejax.errors import InputError
-from vanejax.localization.calibration import Calibration
 from vanejax.localization.fine_registration import robust_gauss_newton, subset
 from vanejax.localization.noise import LEAST_COSINE, fit_noise
 from vanejax.localization.pose_batch import select, stack
 from vanejax.localization.pose_result import FormDeviation, Refinement
 from vanejax.localization.random_fields import Average, Patches, Prior, average_models
 from vanejax.localization.residuals import MeasurementModel, RayCasting, Residuals, moved
+from vanejax.localization.sensor_calibration import Calibration
 from vanejax.rigid import RigidTransform
 
 POINTS = 20_000

@@ -20,7 +20,6 @@ from vanejax.localization.assessment import (
     choose,
     competing_hypotheses,
 )
-from vanejax.localization.calibration import Calibration
 from vanejax.localization.clutter_removal import segmentations, with_clutter, without_clutter
 from vanejax.localization.edge_rounding import check_window, refine_sharpened
 from vanejax.localization.fine_registration import refine, subset
@@ -29,6 +28,7 @@ from vanejax.localization.pose_batch import concatenate, select, stack
 from vanejax.localization.pose_result import PoseResult, Refinement, Verdict
 from vanejax.localization.pose_search import Candidates, converge, initial_poses, search
 from vanejax.localization.residuals import MeasurementModel, RayCasting, measurement_model
+from vanejax.localization.sensor_calibration import Calibration
 from vanejax.localization.verdict import Limits
 from vanejax.rigid import RigidTransform, rigid_from_matrix
 from vanejax.scanner.sensor import Sensor, preset

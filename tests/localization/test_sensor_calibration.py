@@ -9,7 +9,7 @@ import pytest
 from example_scans import SMALL, ideal_scan, model, vane
 
 from vanejax.errors import InputError
-from vanejax.localization.calibration import Calibration
+from vanejax.localization.sensor_calibration import Calibration
 from vanejax.scanner import Sensor, measure
 from vanejax.scanner.range_errors import Lens, Trueness
 from vanejax.scans import MeasuredScan
