@@ -435,6 +435,9 @@ def _result(
         in_camera = pose.inverse().apply(model.part.center[None])[0] - model.sensor_origin
         sight = SCALE_SIGMA * scale * (pose.rotation @ in_camera)
         covariance[3:, 3:] += np.outer(sight, sight)
+    # of so large a rest nothing but its size is known: the pose of all points is as good
+    if form.field_mm > CLEAR_MM and not present.any():
+        pose = refinement.part_from_camera
     return dataclasses.replace(
         refinement,
         part_from_camera=pose,
