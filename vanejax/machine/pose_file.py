@@ -41,9 +41,10 @@ CONVENTIONS = {
     "null": "not known",
 }
 _UNCERTAINTY = (
-    "one sigma of white noise, of a small motion e = (rotation vector in rad, translation in mm) "
+    "one sigma of a small motion e = (rotation vector in rad, translation in mm) "
     "about the part's centre c, in the part's frame: x -> c + exp(e[:3]) (x - c) + e[3:]. "
-    "Left out: calibration of the sensor, and how far the casting differs from its CAD model."
+    "It contains how the part differs from its CAD model as far as the scan shows it, and the "
+    "sensor's calibration where that was given."
 )
 
 MAX_BYTES = 16 << 20
