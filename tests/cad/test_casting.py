@@ -10,7 +10,16 @@ import trimesh
 from example_scans import vane
 
 from vanejax.cad import Part, part_from_mesh
-from vanejax.cad.investment_casting import CUT, InvestmentCasting, as_cast, waviness
+from vanejax.cad.casting_tolerances import SIZES_MM, TOLERANCES_MM, dimensional_tolerance_mm
+from vanejax.cad.investment_casting import (
+    CUT,
+    InvestmentCasting,
+    as_cast,
+    waviness,
+    with_stock_on_one_side,
+    without_a_corner,
+)
+from vanejax.cad.surface import Surface
 from vanejax.errors import InputError
 from vanejax.plotting.deviation import casting_map
 from vanejax.scanner import Scanner
@@ -46,6 +55,89 @@ def test_stock_moves_the_faces_of_a_box(stock_mm):
     cast = as_cast(box(), dataclasses.replace(STOCK, allowance_mm=stock_mm), rng())
     np.testing.assert_allclose(cast.extent_mm, np.add([60, 40, 20], 2 * stock_mm), atol=1e-3)
     assert cast.mesh.volume == pytest.approx(np.prod(cast.extent_mm), rel=1e-4)
+
+
+def test_stock_is_the_distance_between_the_surfaces_of_a_vane():
+    """At every point of the smooth surface: at an edge it is farther."""
+    cad, points = Surface(vane()), as_cast(vane(), STOCK, rng()).sample(3_000, 0)[0]
+    points = points[cad.is_smooth(points, 2.0, 0.97)]
+    assert len(points) > 1_000
+    closest = cad.nearest(points)  # the nearest sample: the plane of its face is right to 0.01 mm
+    distance = np.sum((points - closest.points) * closest.normals, axis=1)
+    assert np.percentile(np.abs(distance - 0.5), 98) < 0.02
+    volume = [as_cast(vane(), dataclasses.replace(STOCK, allowance_mm=s), rng()).mesh.volume
+              for s in (0.1, 0.5, 1.0)]  # fmt: skip
+    assert vane().mesh.volume < volume[0] < volume[1] < volume[2]
+
+
+@pytest.mark.parametrize("scale_error", [-0.03, 0.01])
+def test_a_casting_of_another_size_keeps_its_middle(scale_error):
+    cast = as_cast(vane(), dataclasses.replace(NOTHING, scale_error=scale_error), rng())
+    np.testing.assert_allclose(cast.extent_mm, vane().extent_mm * (1 + scale_error), rtol=1e-6)
+    np.testing.assert_allclose(cast.center, vane().center, atol=1e-4)
+    assert cast.mesh.volume == pytest.approx(vane().mesh.volume * (1 + scale_error) ** 3, rel=1e-5)
+    both = as_cast(box(), dataclasses.replace(STOCK, scale_error=scale_error), rng())
+    expected = np.array([60, 40, 20]) * (1 + scale_error) + 2 * 0.5
+    np.testing.assert_allclose(both.extent_mm, expected, atol=1e-3)
+
+
+def test_stock_on_one_side_moves_that_side_alone():
+    cast = with_stock_on_one_side(box(), [0, -2.0, 0], 1.5)  # the axis' length does not count
+    np.testing.assert_allclose(cast.mesh.bounds, [[-30, -21.5, -10], [30, 20, 10]])
+    assert cast.mesh.volume == pytest.approx(60 * 41.5 * 20)
+    of_vane = with_stock_on_one_side(vane(), [0, 0, 1], 1.0)
+    assert of_vane.mesh.is_watertight
+    assert of_vane.mesh.volume > vane().mesh.volume
+    assert of_vane.mesh.bounds[1, 2] - vane().mesh.bounds[1, 2] == pytest.approx(1, abs=1e-5)
+    again = with_stock_on_one_side(vane(), [0, 0, 1], 1.0)
+    assert again.sha256 == of_vane.sha256 != vane().sha256
+
+
+def test_a_corner_is_missing_and_the_rest_stays():
+    shares = {"sides": (0.2, 0.5), "volume": (0.03, 0.15)}
+    for seed in range(5):
+        rest = without_a_corner(vane(), rng(seed), **shares)
+        assert 0.03 < 1 - rest.mesh.volume / vane().mesh.volume < 0.15
+        assert rest.mesh.is_watertight
+        solid = trimesh.boolean.difference([rest.mesh, vane().mesh])
+        assert solid.volume < 1e-3 * vane().mesh.volume  # nothing is added
+    one, same, other = (without_a_corner(box(), rng(seed), **shares) for seed in (1, 1, 2))
+    assert one.sha256 == same.sha256 != other.sha256
+    with pytest.raises(InputError, match="none of 200 boxes"):
+        without_a_corner(box(), rng(), sides=(0.1, 0.2), volume=(0.5, 0.9))
+
+
+@pytest.mark.parametrize("stock_mm", [-0.6, -30.0])
+def test_a_wall_that_is_gone_is_an_error(stock_mm):
+    mesh = trimesh.creation.box((60, 40, 1))
+    sheet = part_from_mesh(mesh.vertices, mesh.faces, name="sheet")
+    assert as_cast(sheet, dataclasses.replace(STOCK, allowance_mm=-0.3), rng()).closed
+    with pytest.raises(InputError, match="sheet: with this stock the part loses its walls"):
+        as_cast(sheet, dataclasses.replace(STOCK, allowance_mm=stock_mm), rng())
+    with pytest.raises(InputError, match="loses its walls"):
+        with_stock_on_one_side(sheet, [0, 0, 1], -1.2)
+
+
+@pytest.mark.parametrize("axis", [[0, 0, 0], [0, 0], [np.nan, 0, 1]])
+def test_an_axis_without_a_direction_is_an_error(axis):
+    with pytest.raises(InputError, match="axis x, y, z"):
+        with_stock_on_one_side(box(), axis, 1.0)
+
+
+def test_tolerances_are_those_of_the_standard():
+    """A few of the table, and what holds for all: they grow with the size and with the grade."""
+    assert dimensional_tolerance_mm(100.0, 4) == 0.40
+    assert dimensional_tolerance_mm(100.1, 4) == 0.44  # rows end with their size
+    assert dimensional_tolerance_mm(5.0, 5) == 0.36
+    assert dimensional_tolerance_mm(400.0, 6) == 1.10
+    table = np.array(list(TOLERANCES_MM.values()))
+    assert table.shape == (3, len(SIZES_MM))
+    assert (np.diff(table, axis=0) > 0).all()
+    assert (np.diff(table, axis=1) > 0).all()
+    assert np.all(np.abs(table[1:] / table[:-1] - np.sqrt(2)) < 0.11)  # a grade is a factor of 1.4
+    for size, grade, message in ((100, 3, "DCTG 3"), (0, 4, "of 0 mm"), (np.nan, 5, "of nan mm")):
+        with pytest.raises(InputError, match=message):
+            dimensional_tolerance_mm(size, grade)
 
 
 def test_stock_does_not_fold_a_concave_corner():
@@ -157,6 +249,7 @@ def test_the_map_shows_the_offset():
         ({"waviness_mm": -0.1}, "waviness_mm must be 0 mm or more"),
         ({"bow_mm": -0.1}, "bow_mm must be 0 mm or more"),
         ({"wavelength_mm": 0.0}, "wavelength_mm must be above 0 mm"),
+        ({"scale_error": 1.0}, "0.01 is 1 %"),
     ],
 )
 def test_settings_that_no_casting_can_have(wrong, message):
@@ -171,5 +264,10 @@ def test_a_wavelength_too_short_for_the_part_and_an_open_surface():
     sheet = part_from_mesh(
         solid.mesh.vertices, solid.mesh.faces[:-2], name="sheet", must_be_closed=False
     )
-    with pytest.raises(InputError, match="open surface"):
-        as_cast(sheet, InvestmentCasting(), rng())
+    for make in (
+        lambda: as_cast(sheet, InvestmentCasting(), rng()),
+        lambda: with_stock_on_one_side(sheet, [0, 0, 1], 1.0),
+        lambda: without_a_corner(sheet, rng(), sides=(0.2, 0.5), volume=(0.03, 0.15)),
+    ):
+        with pytest.raises(InputError, match="open surface"):
+            make()

@@ -17,7 +17,7 @@ from vanejax.cad.part import Part
 from vanejax.errors import InputError
 from vanejax.pointcloud import PointCloud
 from vanejax.scanner import Camera, Scanner, Sensor, preset
-from vanejax.training.online_scans import RandomViews, ScanStream
+from vanejax.training.online_scans import OnlineScans, RandomViews, ScanStream
 from vanejax.training.pairs import PairSampling, draw_pairs
 
 CENTER = np.array([30.0, -20.0, 10.0])
@@ -134,6 +134,30 @@ def test_a_casting_is_scanned_and_the_cad_s_pose_is_the_label(stream, box):
     cast = solid(trimesh.creation.box(bounds=[CENTER - HALF - 1, CENTER + HALF + 1]))
     points, _ = dataclasses.replace(stream, castings=[Scanner(cast)]).scan(0)
     np.testing.assert_allclose(off_the_box_mm(points, box), 1.0, atol=2e-3)
+
+
+def test_castings_differ_within_their_ranges(box):
+    """80 x 50 x 30 mm: stock to 0.5 mm, 1 % of the size, 0.39 mm of bow (DCTG 6), 0.3 of waves."""
+    settings = OnlineScans(sensor="ideal", casting_mm=0.5, castings=12)
+    parts, again = (settings.make_parts(box, seed=3) for _ in range(2))
+    assert [p.sha256 for p in parts] == [p.sha256 for p in again]
+    assert len({p.sha256 for p in parts}) == 12
+    assert all(p.closed for p in parts)
+    larger = np.array([p.extent_mm for p in parts]) - 2 * HALF
+    # less to all sides: 1 % of the size; more: stock too; and waves and bow either way
+    assert np.all(larger > -0.01 * 2 * HALF - 0.3)
+    assert np.all(larger < 0.01 * 2 * HALF + 1.0 + 0.39 + 0.6)
+    volume = np.array([p.mesh.volume for p in parts]) / np.prod(2 * HALF)
+    assert volume.min() < 1.02 < 1.06 < volume.max()  # they do differ
+    middle = np.array([p.center for p in parts]) - box.center
+    assert np.abs(middle).max() < 0.6  # the label is the pose of the CAD model
+    assert settings.make_parts(box, seed=4)[0].sha256 != parts[0].sha256
+    assert OnlineScans(sensor="ideal").make_parts(box, seed=3) == [box]
+
+
+def test_a_large_part_has_castings_too():
+    large = solid(trimesh.creation.box((900, 200, 100)))
+    assert len(OnlineScans(casting_mm=0.5, castings=1).make_parts(large, seed=0)) == 1
 
 
 def test_a_measured_scan_is_noisy_and_stays_near(stream, box):

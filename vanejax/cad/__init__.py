@@ -5,7 +5,13 @@ closed solid in millimetres in a fixed order of faces, with samples of its surfa
 and castings of it that differ from the model as investment castings do.
 """
 
-from vanejax.cad.investment_casting import InvestmentCasting, as_cast
+from vanejax.cad.casting_tolerances import dimensional_tolerance_mm
+from vanejax.cad.investment_casting import (
+    InvestmentCasting,
+    as_cast,
+    with_stock_on_one_side,
+    without_a_corner,
+)
 from vanejax.cad.parametric_vane import GuideVaneSegment, guide_vane
 from vanejax.cad.part import Part, load_part, part_from_mesh
 from vanejax.cad.surface import NearestFace, Surface
@@ -19,7 +25,10 @@ __all__ = [
     "Surface",
     "Triangles",
     "as_cast",
+    "dimensional_tolerance_mm",
     "guide_vane",
     "load_part",
     "part_from_mesh",
+    "with_stock_on_one_side",
+    "without_a_corner",
 ]

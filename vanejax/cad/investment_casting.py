@@ -1,21 +1,21 @@
-"""The part as it is cast: machining stock, waviness and distortion that its CAD model lacks.
+"""The part as it is cast: stock, waviness, shrinkage, bow and missing pieces.
 
-All in the CAD model's own frame: a pose found on a scan of the casting is compared with the CAD
-model's.
+All in the CAD model's own frame: the true pose of a casting is the pose of the part as designed.
+`dimensional_tolerance_mm` says what a casting may differ by. Training scans and studies draw their
+castings from here.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import manifold3d
 import numpy as np
-from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import LinearOperator, cg
 
 from vanejax.cad.part import Part, part_from_mesh
-from vanejax.cad.triangles import Triangles
+from vanejax.cad.surface_offset import offset_directions
 from vanejax.errors import InputError
 
 CUT = 3.0  # standard deviations of the waviness: 0.3 % of the surface has more, and is cut off
@@ -23,12 +23,12 @@ FEATURES = 256  # of the random field; its covariance is then off by a sixteenth
 EDGES_PER_WAVELENGTH = 5  # straight edges miss 0.9 % of the waviness
 EDGES_PER_BOW = 16  # along the part: they miss 0.4 % of the bow
 MOST_EDGES = 200  # along the part: 1,000,000 faces
-# of the largest eigenvalue of the faces' normals: below, the faces at a vertex are one plane or
-# two, and the vertex is not moved along the directions that they leave open
-FLAT = 0.02
-# both per mm of offset: how far a face may be from where it belongs if that makes the surface
-# smoother, and how far along a face its vertices give way to a corner's
-SLACK_MM, REACH_MM = 0.03, 10.0
+# share of the surface whose faces an offset may turn over; at the concave corners of usual parts
+# it is below 0.4 %, where a wall is gone or a pocket is full it is several times this
+TURNED_OVER = 0.02
+MOST_SCALE_ERROR = 0.1
+SAME_SIDE = 0.7  # cosine: a face looks along an axis up to 45 deg
+CORNERS_TRIED = 200
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,6 +45,9 @@ class InvestmentCasting:
         ``exp(-(r / wavelength_mm)^2 / 2)``. Its crests lie some 3.6 of these lengths apart.
       bow_mm: how far the middle of the part's longest side is from the line between its ends after
         cooling, in a random direction across it; 0 for none. It comes on top of the offset.
+      scale_error: by how much the casting is larger than the CAD model, relative, about the middle
+        of the part's bounding box: negative where it shrank more than the pattern allowed for. The
+        offset is added after it.
 
     Raises:
       InputError: a value that no casting can have.
@@ -54,6 +57,7 @@ class InvestmentCasting:
     waviness_mm: float = 0.15
     wavelength_mm: float = 30.0
     bow_mm: float = 0.0
+    scale_error: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -70,6 +74,11 @@ class InvestmentCasting:
                 f"casting wavelength_mm must be above 0 mm, got {self.wavelength_mm!r}; "
                 "15 to 60 mm is usual"
             )
+        if abs(self.scale_error) >= MOST_SCALE_ERROR:
+            raise InputError(
+                f"casting scale_error must be within {MOST_SCALE_ERROR:g}, got "
+                f"{self.scale_error!r}; it is relative: 0.01 is 1 %"
+            )
 
 
 def as_cast(part: Part, casting: InvestmentCasting, rng: np.random.Generator) -> Part:
@@ -80,18 +89,80 @@ def as_cast(part: Part, casting: InvestmentCasting, rng: np.random.Generator) ->
     bits, and each of the two is the same whether or not the other is switched on.
 
     Raises:
-      InputError: the part is no solid, or too large for so short a wavelength.
+      InputError: the part is no solid, is too large for so short a wavelength, or loses its walls
+        or pockets. One that is a small share of the part is not noticed: there the surface crosses
+        itself.
     """
-    if not part.closed:
-        raise InputError(f"{part.name}: an open surface has no outside to leave stock on")
+    _check_closed(part)
     field_rng, bow_rng = rng.spawn(2)
-    if not (casting.allowance_mm or casting.waviness_mm or casting.bow_mm):
+    has_offset = casting.allowance_mm or casting.waviness_mm
+    if not (has_offset or casting.bow_mm or casting.scale_error):
         return part
     points, faces = _refined(part, _longest_edge_mm(part, casting))
-    offset = casting.allowance_mm + waviness(points, casting, field_rng)
-    cast = points + offset[:, None] * offset_directions(points, faces)
-    cast += _bow(points, casting.bow_mm, bow_rng)
-    return part_from_mesh(cast, faces, name=f"{part.name} as cast")
+    points = points + casting.scale_error * (points - part.center)
+    cast = points + _bow(points, casting.bow_mm, bow_rng)
+    if has_offset:
+        offset = casting.allowance_mm + waviness(points, casting, field_rng)
+        cast += offset[:, None] * offset_directions(points, faces)
+    return _moved(part, points, cast, faces)
+
+
+def with_stock_on_one_side(part: Part, axis: Sequence[float] | np.ndarray, stock_mm: float) -> Part:
+    """A casting with ``stock_mm`` on the faces that look along ``axis`` [3], in the CAD's frame.
+
+    The faces within 45 deg of the axis move along it, so that a face at 40 deg has 0.77 of the
+    stock along its normal. The faces beside them grow to stay closed.
+
+    Raises:
+      InputError: the part is no solid, the axis has no direction, no face looks along it, or the
+        part loses its walls or pockets, see `as_cast`.
+    """
+    _check_closed(part)
+    axis, length = np.asarray(axis, np.float64), float(np.linalg.norm(axis))
+    if axis.shape != (3,) or not (0 < length < math.inf and math.isfinite(stock_mm)):
+        raise InputError(
+            "stock on one side needs an axis x, y, z that is not zero, and a finite stock in mm; "
+            f"got {axis.tolist()} and {stock_mm!r}"
+        )
+    points, faces = np.array(part.mesh.vertices, np.float64), np.asarray(part.mesh.faces)
+    looking = np.asarray(part.mesh.face_normals) @ (axis / length) > SAME_SIDE
+    if not looking.any():
+        raise InputError(f"{part.name}: no face looks along {axis.tolist()}; choose another axis")
+    cast = points.copy()
+    cast[np.unique(faces[looking])] += stock_mm * axis / length
+    return _moved(part, points, cast, faces)
+
+
+def without_a_corner(
+    part: Part,
+    rng: np.random.Generator,
+    *,
+    sides: tuple[float, float],
+    volume: tuple[float, float],
+) -> Part:
+    """A casting of which a box at a random corner of the bounding box is missing.
+
+    Args:
+      part: a solid.
+      rng: equal generators give equal bits.
+      sides: (least, most) of the box, as shares of the part's sides.
+      volume: (least, most) of what is missing, as shares of the part's volume.
+
+    Raises:
+      InputError: the part is no solid, or no random box takes away so much.
+    """
+    _check_closed(part)
+    solid, low = _solid(part), np.asarray(part.mesh.bounds[0], np.float64)
+    for _ in range(CORNERS_TRIED):
+        size = rng.uniform(*sides, 3) * part.extent_mm
+        corner = low + rng.integers(0, 2, 3) * (part.extent_mm - size)
+        rest = solid - manifold3d.Manifold.cube(size).translate(corner)
+        if volume[0] < 1 - rest.volume() / solid.volume() < volume[1]:
+            return part_from_mesh(*_arrays(rest), name=f"{part.name} as cast")
+    raise InputError(
+        f"{part.name}: none of {CORNERS_TRIED} boxes at its corners, {sides[0]:g} to {sides[1]:g} "
+        f"of its sides, takes away {volume[0]:g} to {volume[1]:g} of its volume; widen a range"
+    )
 
 
 def waviness(
@@ -110,82 +181,6 @@ def waviness(
     phase = points @ waves.T
     field = np.cos(phase) @ cosines + np.sin(phase) @ sines
     return np.clip(field, -CUT * casting.waviness_mm, CUT * casting.waviness_mm)
-
-
-def offset_directions(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """By how much each vertex moves when every face moves outward by 1 mm: [V, 3] f64.
-
-    The field u that minimises, over the surface, ``((n . u - 1) / SLACK_MM)^2 + |grad u|^2 +
-    |u - d|^2 / REACH_MM^2`` with the faces' normals n and the directions d of `_mitres`. On a
-    smooth surface it is the unit normal and at the edge of a box it is sqrt(2) long, to one per
-    mille. In a concave corner the mitres alone would fold the surface over: there vertices of a
-    flat face that are near the corner must move along the face out of its way, and do.
-    """
-    shapes = Triangles(points, faces)
-    area = shapes.areas()
-    cross = np.cross(*np.diff(points[faces], axis=1).swapaxes(0, 1))
-    normals = cross / np.maximum(2 * area, 1e-30)[:, None]
-    start = _mitres(points, faces, normals)
-    squares, total = _at_vertices(len(points), faces, normals, np.repeat(area[:, None] / 3, 3, 1))
-    smooth = _laplacian(points, faces, area)
-    own_area = np.bincount(faces.ravel(), np.repeat(area / 3, 3), len(points))[:, None]
-    local = squares / SLACK_MM**2 + own_area[..., None] / REACH_MM**2 * np.eye(3)
-    wanted = total / SLACK_MM**2 + own_area / REACH_MM**2 * start
-    inverse = np.linalg.inv(local + smooth.diagonal()[:, None, None] * np.eye(3))
-
-    def product(blocks: np.ndarray, flat: np.ndarray) -> np.ndarray:
-        return np.einsum("vij,vj->vi", blocks, flat.reshape(-1, 3))
-
-    def applied(flat: np.ndarray) -> np.ndarray:
-        return (product(local, flat) + smooth @ flat.reshape(-1, 3)).ravel()
-
-    size = (start.size, start.size)
-    near = LinearOperator(size, lambda flat: product(inverse, flat).ravel())
-    # to 1e-5 of the offset, which is below a millimetre
-    options = {"x0": start.ravel(), "rtol": 1e-5, "maxiter": 500, "M": near}
-    directions, _ = cg(LinearOperator(size, applied), wanted.ravel(), **options)
-    return directions.reshape(-1, 3)
-
-
-def _mitres(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """The shortest d [V, 3] with ``n . d = 1`` for the faces at a vertex, weighted by angle."""
-    edges = np.roll(points[faces], -1, axis=1) - points[faces]
-    along = edges / np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-30)
-    cosine = -np.einsum("fki,fki->fk", along, np.roll(along, 1, axis=1))
-    angle = np.arccos(np.clip(cosine, -1, 1))
-    squares, total = _at_vertices(len(points), faces, normals, angle)
-    values, vectors = np.linalg.eigh(squares)
-    known = values > FLAT * values[:, -1:]
-    solved = np.einsum("vij,vi->vj", vectors, total)
-    solved = np.where(known, solved / np.where(known, values, 1.0), 0.0)
-    return np.einsum("vij,vj->vi", vectors, solved)
-
-
-def _at_vertices(
-    count: int, faces: np.ndarray, normals: np.ndarray, weight: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sums over a vertex's faces of ``w n n^T`` [V, 3, 3] and ``w n`` [V, 3]; weight [F, 3]."""
-    squares, total = np.zeros((count, 3, 3)), np.zeros((count, 3))
-    outer = normals[:, :, None] * normals[:, None, :]
-    for k in range(3):
-        np.add.at(squares, faces[:, k], weight[:, k, None, None] * outer)
-        np.add.at(total, faces[:, k], weight[:, k, None] * normals)
-    return squares, total
-
-
-def _laplacian(points: np.ndarray, faces: np.ndarray, area: np.ndarray) -> csr_array:
-    """[V, V]: ``u^T L u`` is about the integral of ``|grad u|^2`` over the surface.
-
-    An edge weighs two thirds of its faces' area by its squared length. The cotangent formula is
-    exact, but slivers make it indefinite.
-    """
-    first, second = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    squared = np.maximum(np.sum((points[first] - points[second]) ** 2, axis=1), 1e-12)
-    weight = np.repeat(area, 3) * (2 / 3) / squared
-    shape = (len(points), len(points))
-    ways = csr_array((weight, (first, second)), shape=shape)
-    ways = ways + ways.T
-    return csr_array(diags_array(np.asarray(ways.sum(axis=1))) - ways)
 
 
 def _longest_edge_mm(part: Part, casting: InvestmentCasting) -> float:
@@ -208,18 +203,50 @@ def _refined(part: Part, edge_mm: float) -> tuple[np.ndarray, np.ndarray]:
 
     By manifold3d, which splits an edge on both its faces at once; else the surface would tear.
     """
+    if not math.isfinite(edge_mm):
+        return np.array(part.mesh.vertices, np.float64), np.array(part.mesh.faces, np.int64)
+    return _arrays(_solid(part).refine_to_length(edge_mm))
+
+
+def _solid(part: Part) -> manifold3d.Manifold:
     points = np.array(part.mesh.vertices, np.float64)
     faces = np.array(part.mesh.faces, np.uint64)
-    if math.isfinite(edge_mm):
-        solid = manifold3d.Manifold(manifold3d.Mesh64(points, faces))
-        if solid.status() != manifold3d.Error.NoError:
-            raise InputError(
-                f"{part.name}: its mesh cannot be refined ({solid.status().name}); "
-                "export the part again as one solid body"
-            )
-        mesh = solid.refine_to_length(edge_mm).to_mesh64()
-        points, faces = np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts)
-    return points, faces.astype(np.int64)
+    solid = manifold3d.Manifold(manifold3d.Mesh64(points, faces))
+    if solid.status() != manifold3d.Error.NoError:
+        raise InputError(
+            f"{part.name}: its mesh cannot be refined or cut ({solid.status().name}); "
+            "export the part again as one solid body"
+        )
+    return solid
+
+
+def _arrays(solid: manifold3d.Manifold) -> tuple[np.ndarray, np.ndarray]:
+    """Points [V, 3] f64 and faces [F, 3] i64."""
+    mesh = solid.to_mesh64()
+    return np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts).astype(np.int64)
+
+
+def _check_closed(part: Part) -> None:
+    if not part.closed:
+        raise InputError(
+            f"{part.name}: no casting can be made of an open surface; export the part as one solid body"
+        )
+
+
+def _moved(part: Part, before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> Part:
+    """The part with its vertices [V, 3] moved, where this leaves a solid."""
+    old, new = (
+        np.cross(*np.diff(points[faces], axis=1).swapaxes(0, 1)) for points in (before, after)
+    )
+    area = np.linalg.norm(old, axis=1)
+    turned = np.sum(old * new, axis=1) < 0
+    volume = np.sum(after[faces[:, 0]] * new)  # times 6, signed
+    if volume <= 0 or area[turned].sum() > TURNED_OVER * area.sum():
+        raise InputError(
+            f"{part.name}: with this stock the part loses its walls or fills its pockets; "
+            "the amount must be below half of their width"
+        )
+    return part_from_mesh(after, faces, name=f"{part.name} as cast")
 
 
 def _bow(points: np.ndarray, bow_mm: float, rng: np.random.Generator) -> np.ndarray:

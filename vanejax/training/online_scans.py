@@ -16,7 +16,7 @@ from contextlib import contextmanager
 import jax.numpy as jnp
 import numpy as np
 
-from vanejax.cad import InvestmentCasting, Part, as_cast
+from vanejax.cad import InvestmentCasting, Part, as_cast, dimensional_tolerance_mm
 from vanejax.errors import InputError
 from vanejax.pointcloud import PointCloud
 from vanejax.rigid import RigidTransform
@@ -31,6 +31,10 @@ from vanejax.training.pairs import PairSampling, ScanBank, make_bank
 STEPS_AHEAD = 16
 LEAST_POINTS = 32
 ATTEMPTS = 20
+# of the castings: waves as a share of the largest stock, their correlation length, the size, and
+# the grade of ISO 8062-3 that the bow keeps
+WAVINESS, CORRELATION_MM, SCALE_ERROR, GRADE = 0.2, (20.0, 60.0), 0.01, 6
+LARGEST_MM = 630.0  # in the table of the grades; larger parts are bent as this one
 _CASTINGS = 0xCA57  # folded into the seed: castings are drawn from another stream than scans
 _AHEAD_OF_VALIDATION = 1 << 40  # scan numbers that no training reaches
 
@@ -82,7 +86,9 @@ class OnlineScans(RandomViews):
         empty for the fixed scans.
       effects: off for an ideal camera of the same pixels, view and range in the sensor's place.
       resolution: share of the sensor's pixels per side.
-      casting_mm: largest allowance of the castings that are scanned; 0 for the CAD model itself.
+      casting_mm: largest stock of the castings that are scanned, which are warped and shrunk as
+        `make_parts` says; 0 for the CAD model itself. The reference and the true pose are those of
+        the CAD model.
       castings: how many different ones there are.
       workers: threads that scan ahead; they change no result.
     """
@@ -103,17 +109,21 @@ class OnlineScans(RandomViews):
     def make_parts(self, part: Part, seed: int) -> list[Part]:
         """The parts that are scanned: the CAD model, or castings of it.
 
-        They have stock of up to ``casting_mm``; waves (one deviation) and a bow of up to a fifth of
-        it.
+        Each of their deviations is drawn uniformly: stock of up to ``casting_mm``; waves (one
+        standard deviation) of up to a fifth of it, correlated over 20 to 60 mm; a size within 1 %
+        of the CAD model's; a bow of up to half the tolerance of the longest side (DCTG 6).
         """
         parts, most_mm = [], self.casting_mm
+        longest_mm = min(float(part.extent_mm.max()), LARGEST_MM)
+        most_bow_mm = dimensional_tolerance_mm(longest_mm, GRADE) / 2
         for number in range(self.castings if most_mm else 0):
             rng = np.random.default_rng([seed, _CASTINGS, number])
             casting = InvestmentCasting(
                 allowance_mm=rng.uniform(0, most_mm),
-                waviness_mm=rng.uniform(0, most_mm / 5),
-                wavelength_mm=rng.uniform(20, 60),
-                bow_mm=rng.uniform(0, most_mm / 5),
+                waviness_mm=rng.uniform(0, WAVINESS * most_mm),
+                wavelength_mm=rng.uniform(*CORRELATION_MM),
+                bow_mm=rng.uniform(0, most_bow_mm),
+                scale_error=rng.uniform(-SCALE_ERROR, SCALE_ERROR),
             )
             parts.append(as_cast(part, casting, rng))
         return parts or [part]
