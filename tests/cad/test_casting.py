@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
+from example_scans import box as box_off_its_origin
 from example_scans import vane
 
 from vanejax.cad import Part, part_from_mesh
@@ -71,14 +72,18 @@ def test_stock_is_the_distance_between_the_surfaces_of_a_vane():
 
 
 @pytest.mark.parametrize("scale_error", [-0.03, 0.01])
-def test_a_casting_of_another_size_keeps_its_middle(scale_error):
-    cast = as_cast(vane(), dataclasses.replace(NOTHING, scale_error=scale_error), rng())
-    np.testing.assert_allclose(cast.extent_mm, vane().extent_mm * (1 + scale_error), rtol=1e-6)
-    np.testing.assert_allclose(cast.center, vane().center, atol=1e-4)
-    assert cast.mesh.volume == pytest.approx(vane().mesh.volume * (1 + scale_error) ** 3, rel=1e-5)
-    both = as_cast(box(), dataclasses.replace(STOCK, scale_error=scale_error), rng())
-    expected = np.array([60, 40, 20]) * (1 + scale_error) + 2 * 0.5
-    np.testing.assert_allclose(both.extent_mm, expected, atol=1e-3)
+@pytest.mark.parametrize("make", [vane, box_off_its_origin])
+def test_a_casting_of_another_size_keeps_its_middle(make, scale_error):
+    part, larger = make(), dataclasses.replace(NOTHING, scale_error=scale_error)
+    cast = as_cast(part, larger, rng())
+    np.testing.assert_allclose(cast.extent_mm, part.extent_mm * (1 + scale_error), rtol=1e-6)
+    np.testing.assert_allclose(cast.center, part.center, atol=1e-4)
+    assert cast.mesh.volume == pytest.approx(part.mesh.volume * (1 + scale_error) ** 3, rel=1e-5)
+
+
+def test_stock_is_added_after_shrinkage():
+    cast = as_cast(box(), dataclasses.replace(STOCK, scale_error=-0.03), rng())
+    np.testing.assert_allclose(cast.extent_mm, np.array([60, 40, 20]) * 0.97 + 1, atol=1e-3)
 
 
 def test_stock_on_one_side_moves_that_side_alone():

@@ -229,7 +229,8 @@ def _arrays(solid: manifold3d.Manifold) -> tuple[np.ndarray, np.ndarray]:
 def _check_closed(part: Part) -> None:
     if not part.closed:
         raise InputError(
-            f"{part.name}: no casting can be made of an open surface; export the part as one solid body"
+            f"{part.name}: no casting can be made of an open surface; "
+            "export the part as one solid body"
         )
 
 
