@@ -1,8 +1,8 @@
 """Single scans of castings that differ from their CAD model, by cameras with errors of their own.
 
 The castings are made by `vanejax.cad.investment_casting`; here are the ranges of what is drawn.
-Stock is not a deviation, and wrong sizes and missing corners are faults beyond any tolerance; the
-others are within the finer grades of ISO 8062-3 (docs/castings.md).
+Waves and bow are about what grade 6 of ISO 8062-3 allows. Stock is an allowance, and wrong sizes
+and missing corners are faults beyond any tolerance (docs/castings.md).
 """
 
 from __future__ import annotations
