@@ -38,7 +38,7 @@ def example_result(status: str = "accepted", *, sensor: bool = True) -> pose_res
             information=np.diag(np.arange(1.0, 7.0)),
         ),
         uncertainty=pose_result.Uncertainty(
-            covariance=np.diag(1 / np.arange(1.0, 7.0)),
+            covariance=np.diag([*np.radians([1e-3, 2e-3, 3e-3]), 4e-3, 5e-3, 6e-3]) ** 2,
             center=np.array([1.0, 2.0, 3.0]),
             rotation_sigma_deg=np.array([0.001, 0.002, 0.003]),
             translation_sigma_mm=np.array([0.004, 0.005, 0.006]),

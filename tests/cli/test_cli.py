@@ -175,8 +175,11 @@ def test_json_and_report_are_written(files, fake, capsys, monkeypatch, tmp_path,
     reports = []
     monkeypatch.setattr(vanejax.report, "write_report", lambda *given: reports.append(given))
     outputs = ["--json", tmp_path / "pose.json", "--report", tmp_path / "report.html"]
-    assert register(files, *outputs) == 3
+    asked = ["--calibration", "paper_camera", "--tolerance", "0.2mm,0.1deg"]
+    assert register(files, *outputs, *asked) == 3
     values = json.loads((tmp_path / "pose.json").read_text())
+    assert values["calibration"] == "paper_camera"
+    assert values["tolerance"] == {"mm": 0.2, "deg": 0.1}
     assert values["part"] == {"name": "wedge", "sha256": wedge.sha256}
     assert values["verdict"]["status"] == "ambiguous"
     found = read_pose(tmp_path / "pose.json")
@@ -212,6 +215,11 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
         (["register", "scan.ply", "wedge.stl", "--init", "none.json"], "none.json: no such file"),
         (["register", "scan.ply", "wedge.stl", "--weights", "none.npz"], "none.npz: no such file"),
         (["register", "scan.ply", "wedge.stl", "--weights", "text.docx"], "not a weights file"),
+        (
+            ["register", "scan.ply", "wedge.stl", "--tolerance", "1mm"],
+            "a length and an angle above",
+        ),
+        (["register", "scan.ply", "wedge.stl", "--calibration", "ideal"], "'ideal' has no errors"),
         (["register", "scan.ply", "wedge.stl", "--sensor-origin", "here"], "here: should be X,Y,Z"),
         (["register", "scan.ply", "wedge.stl", "--sensor-origin", "1,2"], "should be X,Y,Z"),
         (["register", "scan.ply", "wedge.stl", "--sensor-origin", "1,2,nan"], "should be X,Y,Z"),

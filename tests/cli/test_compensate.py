@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -16,8 +17,9 @@ from example_result import example_result, pose
 
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.cli.program import main
+from vanejax.localization.pose_result import BOUND, FormDeviation
 from vanejax.machine.frame_notation import NOTATIONS, read_kuka, write_kuka
-from vanejax.machine.pose_file import read_record, write_result
+from vanejax.machine.pose_file import write_result
 from vanejax.machine.tool_path import ToolPath, read_tool_path, write_tool_path
 
 ROOT = Path(__file__).parents[2]
@@ -36,18 +38,21 @@ def box() -> Part:
     return part_from_mesh(mesh.vertices, mesh.faces, name="box")
 
 
+def write_pose(path: str, box: Part, status: str = "accepted", **form) -> None:
+    """A pose file of the example's result; of a casting, where its form is given."""
+    result = example_result(status)
+    if form:
+        refinement = dataclasses.replace(result.refinement, form=FormDeviation(**form))
+        result = dataclasses.replace(result, refinement=refinement)
+    write_result(path, result, scan_name="scan", part_name="box", part_sha256=box.sha256)
+
+
 @pytest.fixture
 def files(box: Part, tmp_path: Path, monkeypatch) -> Path:
     """A folder with a pose of each verdict, a calibration, a nominal frame, a path and the part."""
     monkeypatch.chdir(tmp_path)
     for status in ("accepted", "ambiguous", "rejected"):
-        write_result(
-            f"{status}.json",
-            example_result(status),
-            scan_name="scan",
-            part_name="box",
-            part_sha256=box.sha256,
-        )
+        write_pose(f"{status}.json", box, status)
     camera = {"machine_from_camera": MACHINE_FROM_CAMERA.as_matrix().tolist()}
     Path("camera.json").write_text(json.dumps(camera))
     Path("nominal.txt").write_text(write_kuka(NOMINAL))
@@ -81,7 +86,7 @@ def test_it_prints_the_work_frame_in_every_notation(files: Path, capsys) -> None
 
 def test_it_prints_the_compensation_in_both_frames(files: Path, capsys) -> None:
     assert main(["compensate", *CELL, "--format", "kuka"]) == 0
-    head, kuka, words, in_machine, in_part = sections(capsys.readouterr().out)
+    head, kuka, words, in_machine, in_part, _ = sections(capsys.readouterr().out)
     assert head.startswith("work frame: machine_from_part")
     np.testing.assert_allclose(
         read_kuka(kuka).as_matrix(), MACHINE_FROM_PART.as_matrix(), **ROUNDED
@@ -142,7 +147,7 @@ def test_the_path_is_moved_to_the_part(files: Path, capsys, frame: str) -> None:
     expected = path.moved(MACHINE_FROM_PART)
     np.testing.assert_allclose(found.points, expected.points, rtol=0, atol=5e-4)
     np.testing.assert_allclose(found.axes, expected.axes, rtol=0, atol=1e-6)
-    words = sections(capsys.readouterr().out)[-1]
+    words = sections(capsys.readouterr().out)[-2]
     assert words.startswith("tool path: 4 points with tool axes, machine frame: moved.csv")
     assert re.search(r"compensated: .* by 0\.000\d mm .*; 100\.0% within 0\.05 mm", words)
     assert re.search(r"as programmed: .* [1-9]\.\d+ mm at most; 0\.0% within 0\.05 mm", words)
@@ -167,6 +172,17 @@ def test_what_rounding_costs_is_said_for_the_part(files: Path, capsys) -> None:
         (["accepted.json", "--out", "moved.csv"], "--tool-path and --out go together"),
         (["accepted.json", "--path-frame", "machine"], "--path-frame machine needs --nominal"),
         (["accepted.json", "--tolerance-mm", "0"], "--tolerance-mm 0.0: should be more"),
+        (
+            ["accepted.json", "--max-uncertainty-mm", "-1"],
+            "--max-uncertainty-mm -1.0: should be more",
+        ),
+        (["bare.json", "--max-uncertainty-mm", "1"], "bare.json has no covariance"),
+        (["accepted.json", "--camera-sigma", "0.1mm,0.1deg"], "needs --camera-pose"),
+        (
+            [*CELL, "--camera-sigma", "0.1mm"],
+            "--camera-sigma 0.1mm: should be a length and an angle",
+        ),
+        ([*CELL, "--camera-sigma", "0.1mm,0deg"], "--camera-sigma 0.1mm,0deg: should be"),
         (["accepted.json", "--tool-path", "path.csv", "--out", "path.csv"], "is an input already"),
         (["accepted.json", "--tool-path", "path.csv", "--out", "no/a.csv"], "No such file"),
         (["accepted.json", "--part", "vane"], "is not the part of accepted.json"),
@@ -179,6 +195,7 @@ def test_bad_input_is_one_line(files: Path, capsys, arguments: list[str], words:
     values = json.loads(Path("accepted.json").read_text())
     Path("odd.json").write_text(json.dumps(values | {"verdict": {"status": "fine"}}))
     Path("word.json").write_text(json.dumps(values | {"verdict": "accepted"}))
+    Path("bare.json").write_text(json.dumps(PART_FROM_CAMERA.as_matrix().tolist()))
     assert main(["compensate", *arguments]) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -188,14 +205,124 @@ def test_bad_input_is_one_line(files: Path, capsys, arguments: list[str], words:
     assert not Path("moved.csv").exists()
 
 
-def test_the_record_of_a_pose(files: Path, box: Part) -> None:
-    record = read_record("ambiguous.json")
-    assert (record.verdict.status, record.part_sha256) == ("ambiguous", box.sha256)
-    found, truth = record.part_from_camera.as_matrix(), PART_FROM_CAMERA.as_matrix()
-    np.testing.assert_allclose(found, truth, rtol=0, atol=1e-14)
-    Path("bare.json").write_text(json.dumps(np.eye(4).tolist()))
-    bare = read_record("bare.json")
-    assert (bare.verdict, bare.part_sha256) == (None, None)
+# how well it is known
+
+
+PATH = ["--tool-path", "path.csv", "--out", "moved.csv"]
+
+
+def known_mm(out: str, what: str) -> float:
+    """The bound that is printed for the centre, the surface or the tip."""
+    return float(re.search(rf"{what} is known to ([\d.]+) mm \(95 %\)", out)[1])
+
+
+def test_without_a_camera_sigma_the_pose_alone_counts(files: Path, capsys) -> None:
+    assert main(["compensate", *CELL, *PATH, "--part", "box.stl"]) == 0
+    out = capsys.readouterr().out
+    # of the example the largest sigma is 0.006 mm; 0.003 deg at 36 mm are a third of that
+    assert known_mm(out, "centre") == pytest.approx(BOUND * 0.006, abs=5e-4)
+    assert 0.012 <= known_mm(out, "tool tip") <= known_mm(out, "surface") < 0.02
+    assert "by the camera's place" not in out
+    assert "\n  the camera's place in the machine is taken as exact (no --camera-sigma)\n" in out
+    assert "\n  errors of the camera's own calibration do not count" in out
+
+
+def test_the_cameras_place_counts_by_its_distance(files: Path, capsys) -> None:
+    sigma = ["--camera-sigma", "0.02mm,0.01deg"]
+    assert main(["compensate", *CELL, *sigma, *PATH, "--format", "kuka"]) == 0
+    out = capsys.readouterr().out
+    points = read_tool_path("moved.csv").points
+    arms = np.linalg.norm(points - MACHINE_FROM_CAMERA.translation, axis=1)
+    expected = BOUND * np.hypot(0.02, np.radians(0.01) * arms)
+    worst = int(expected.argmax())
+    assert known_mm(out, "tool tip") == pytest.approx(expected[worst], abs=2e-3)  # 0.012 the pose
+    place = ", ".join(f"{v:.1f}" for v in points[worst])
+    assert f"worst at point {worst + 1} ({place})" in out
+    assert f"{expected[worst]:.3f} mm by the camera's place alone" in out
+    assert "taken as exact" not in out
+
+
+def test_what_is_not_known_well_enough_moves_nothing(files: Path, capsys, box: Part) -> None:
+    command = ["compensate", *CELL, *PATH]
+    for options, words in (
+        (
+            ["--camera-sigma", "0.02mm,0.1deg"],
+            "at most 1 mm is allowed: most of that is the camera",
+        ),
+        (["--max-uncertainty-mm", "0.01"], "at most 0.01 mm is allowed: scan more of the part"),
+    ):
+        assert main([*command, *options]) == 3
+        out, err = capsys.readouterr()
+        assert (out, err.count("\n")) == ("", 1)
+        assert re.match(
+            r"vanejax: refused: the tool tip is known to \S+ mm only \(95 %\), worst at", err
+        )
+        assert words in err
+        assert not Path("moved.csv").exists()
+    assert main([*command, "--camera-sigma", "0.02mm,0.1deg", "--max-uncertainty-mm", "2"]) == 0
+    assert Path("moved.csv").exists()
+
+
+def test_the_verdicts_tolerance_is_kept(files: Path, capsys) -> None:
+    values = json.loads(Path("accepted.json").read_text())
+    Path("strict.json").write_text(json.dumps(values | {"tolerance": {"mm": 0.01, "deg": 0.5}}))
+    command = ["compensate", "strict.json", "--format", "kuka"]
+    assert main(command) == 3
+    assert "the part's centre is known to 0.012 mm only (95 %), and" in capsys.readouterr().err
+    assert main([*command, "--max-uncertainty-mm", "0.02"]) == 0
+
+
+UNCHANGED = ({"converged": True}, {"converged": False})
+
+
+@pytest.mark.parametrize(
+    ("form", "words"),
+    [
+        (
+            {"stock_mm": 0.503, "stock_sigma_mm": 0.003},
+            "casting has 0.503 +- 0.003 mm of stock: the first cut is that much deeper",
+        ),
+        (
+            {"stock_mm": -0.2, "stock_sigma_mm": 0.01},
+            "surface lies 0.200 +- 0.010 mm inside the CAD model: the tool cuts that much less",
+        ),
+        (
+            {"field": "form", "field_mm": 0.12, "field_length_mm": 20.0},
+            "off its CAD model by 0.12 mm (1 sigma) over 20 mm beyond the pose: the depth of cut "
+            "varies by as much (95 %: 0.24 mm)",
+        ),
+        ({"field": "range", "field_mm": 0.01}, "the sensor's range seems to vary by 0.01 mm"),
+        ({"field": "facing", "field_mm": 0.3}, "differs from face to face by as much (95 %: 0.59"),
+        (
+            # the corner of the box is 36.4 mm from its centre
+            {"scale_error": 0.01, "scale_sigma": 0.001},
+            "the camera's scale off, cuts are up to 0.36 +- 0.04 mm deeper, 36 mm from its centre",
+        ),
+        ({"focal_error": 0.001}, "focal length is off by +0.10% +- 0.00%: the pose allows for it"),
+        ({"converged": True}, "no difference from the CAD model shows"),
+        ({"converged": False}, "note: the estimate of how the part differs from its CAD model did"),
+        ({"is_told": False}, "note: too little smooth surface was measured"),
+    ],
+)
+def test_what_the_form_does_to_the_cut_is_said(
+    files: Path, capsys, box: Part, form: dict, words: str
+) -> None:
+    write_pose("cast.json", box, **form)
+    assert main(["compensate", "cast.json", "--part", "box.stl", "--format", "kuka"]) == 0
+    out = capsys.readouterr().out
+    assert words in out
+    assert ("no difference from the CAD model shows" in out) == (form in UNCHANGED)
+    assert "note: nothing is known of how the part differs" not in out
+
+
+def test_of_an_old_file_nothing_more_is_said(files: Path, capsys) -> None:
+    Path("bare.json").write_text(json.dumps(PART_FROM_CAMERA.as_matrix().tolist()))
+    assert main(["compensate", "bare.json", *CELL[1:], *PATH]) == 0
+    out = capsys.readouterr().out
+    assert "is known to" not in out
+    assert "note: the pose file has no covariance: nothing is known of how far" in out
+    assert "note: nothing is known of how the part differs from its CAD model" in out
+    assert Path("moved.csv").exists()
 
 
 # the page

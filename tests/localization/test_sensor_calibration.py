@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+from ast import literal_eval
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from vanejax.errors import InputError
 from vanejax.localization.sensor_calibration import Calibration
 from vanejax.scanner import Sensor, measure
 from vanejax.scanner.range_errors import Lens, Trueness
+from vanejax.scanner.sensor import PRESETS
 from vanejax.scans import MeasuredScan
 
 ERRORS = {
@@ -44,6 +48,27 @@ def test_each_error_counts_once():
     assert full.displacements(points).shape == (10, 2, 3)
     assert Calibration().displacements(points).shape == (0, 2, 3)
     assert len(Calibration.of("paper_camera").displacements(points)) == 10
+
+
+@pytest.mark.parametrize("sensor", ["ideal", "consumer_depth", Sensor(noise_px=0.1)])
+def test_a_sensor_without_errors_of_calibration_is_refused(sensor):
+    """It would count for nothing, and the covariance would look complete."""
+    with pytest.raises(InputError, match=r"no errors of calibration .*: paper_camera"):
+        Calibration.of(sensor)
+
+
+def test_the_page_has_the_figures_of_every_calibrated_preset():
+    page = (Path(__file__).parents[2] / "docs" / "virtual_scans.md").read_text()
+    (names,) = re.findall(r"^\| error of calibration .* \| `(\w+)` \|$", page, re.MULTILINE)
+    rows = dict(re.findall(r"^\| `(\w+\.\w+)` \|.*\| ([^|]+) \|$", page, re.MULTILINE))
+    assert [n for n, make in PRESETS.items() if make().lens or make().trueness] == [names]
+    calibration = Calibration.of(names)
+    expected = {
+        f"{part}.{field.name}": getattr(errors, field.name)
+        for part, errors in (("lens", calibration.lens), ("trueness", calibration.trueness))
+        for field in dataclasses.fields(errors)
+    }
+    assert {name: literal_eval(value) for name, value in rows.items()} == expected
 
 
 def test_the_scan_must_be_in_the_cameras_frame():

@@ -7,8 +7,8 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from vanejax.cli import workpiece
-from vanejax.cli.register import EXIT_CODES
+from vanejax.cli import cut_summary, workpiece
+from vanejax.cli.register import EXIT_CODES, parse_mm_deg
 from vanejax.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
     from vanejax.cad.part import Part
     from vanejax.machine.controllers import Compensation
-    from vanejax.machine.pose_file import PoseRecord
+    from vanejax.machine.pose_record import PoseRecord
+    from vanejax.machine.tool_path import ToolPath
     from vanejax.rigid import RigidTransform
 
 FORMATS = ("matrix", "kuka", "iso", "heidenhain", "siemens")
@@ -34,6 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="machine_from_camera, from the calibration of the sensor: "
         f"{_FRAME_HELP}; without it the scan is taken to be in the machine's frame",
+    )
+    parser.add_argument(
+        "--camera-sigma",
+        metavar="MM,DEG",
+        help="standard deviation of the camera's place in the machine, along and about each axis "
+        "at the camera's origin, such as 0.02mm,0.01deg; without it the place is taken as exact",
     )
     parser.add_argument(
         "--nominal",
@@ -76,54 +83,56 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MM",
         help="of the path from the part's surface (0.05)",
     )
+    parser.add_argument(
+        "--max-uncertainty-mm",
+        type=float,
+        metavar="MM",
+        help="the largest 95 %% bound that is taken, of the tool tip, or without a path of the "
+        "part; by default what the verdict asked of the pose, else 1",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Prints the work frame and the compensation, and moves the path.
 
-    A pose that was not accepted is refused with the exit code of its verdict.
+    A pose that was not accepted is refused with the exit code of its verdict, one that is not known
+    well enough where it matters with that of an ambiguous one.
 
     Raises:
       InputError: an argument or a file that cannot be used.
     """
     _check(arguments)
 
-    from vanejax.machine.controllers import Compensation, read_frame
-    from vanejax.machine.pose_file import read_record
+    from vanejax.machine.controllers import Compensation
+    from vanejax.machine.pose_record import read_record
+    from vanejax.machine.tool_path import compensate, read_tool_path
 
     record = read_record(arguments.pose)
     code = _refusal(record, arguments)
     if code:
         return code
-    notes = []
-    if record.verdict is None:
-        notes.append("the pose has no verdict: nobody checked it")
-    elif record.verdict.status != "accepted":
-        notes.append(f"the pose is {record.verdict.status}: {record.verdict.reason}")
-    machine_from_part = record.part_from_camera.inverse()
-    if arguments.camera_pose is None:
-        notes.append("the scan's frame is taken to be the machine's (no --camera-pose)")
-    else:
-        machine_from_camera = read_frame(arguments.camera_pose, target="machine", source="camera")
-        machine_from_part = machine_from_camera @ machine_from_part
-    compensation = None
-    if arguments.nominal is not None:
-        nominal = read_frame(arguments.nominal, target="machine", source="part")
-        compensation = Compensation(machine_from_part, nominal)
-    part = None
-    if arguments.cad is not None:
-        part = workpiece.load_workpiece(arguments, must_be_closed=False)
-        if record.part_sha256 not in (None, part.sha256):
-            raise InputError(
-                f"--part {arguments.cad}: is not the part of {arguments.pose} (another sha256); "
-                "give the CAD file that was registered"
-            )
+    machine_from_camera, machine_from_part, compensation = _frames(record, arguments)
+    part = _part(record, arguments)
+    path = moved = None
+    if arguments.tool_path is not None:
+        path = read_tool_path(arguments.tool_path)
+        known = compensation or Compensation(machine_from_part, machine_from_part)
+        moved = compensate(path, known, frame=arguments.path_frame)
+    places = _places(record, arguments, machine_from_camera, machine_from_part, part, moved)
+    if places and (reason := _too_uncertain(places[-1], record, arguments)):
+        print(f"vanejax: refused: {reason}", file=sys.stderr)
+        return EXIT_CODES["ambiguous"]
     lines = _work_frame(machine_from_part, arguments.format, part)
     if compensation is not None:
         lines += _compensation(compensation, arguments.format, part)
-    if arguments.tool_path is not None:
-        lines += _tool_path(arguments, machine_from_part, compensation, part)
-    print("\n".join(lines + [f"note: {note}" for note in notes]))
+    if path is not None:
+        lines += _tool_path(arguments, path, moved, machine_from_part, compensation, part)
+    if places:
+        exact = arguments.camera_pose is not None and arguments.camera_sigma is None
+        lines += cut_summary.place_lines(places, record, camera_is_exact=exact)
+    if record.form is not None:
+        lines += cut_summary.form_lines(record.form, None if part is None else part.radius)
+    print("\n".join(lines + [f"note: {note}" for note in _notes(record, arguments)]))
     return 0
 
 
@@ -137,6 +146,13 @@ def _check(arguments: argparse.Namespace) -> None:
         )
     if not 0 < arguments.tolerance_mm < float("inf"):
         raise InputError(f"--tolerance-mm {arguments.tolerance_mm}: should be more than 0")
+    most = arguments.max_uncertainty_mm
+    if most is not None and not 0 < most < float("inf"):
+        raise InputError(f"--max-uncertainty-mm {most}: should be more than 0")
+    if arguments.camera_sigma is not None:
+        parse_mm_deg(arguments.camera_sigma, option="--camera-sigma")
+        if arguments.camera_pose is None:
+            raise InputError("--camera-sigma needs --camera-pose: where the camera is")
     if arguments.out is None:
         return
     from vanejax.files import check_writable
@@ -161,6 +177,85 @@ def _refusal(record: PoseRecord, arguments: argparse.Namespace) -> int:
         file=sys.stderr,
     )
     return EXIT_CODES[verdict.status]
+
+
+def _frames(
+    record: PoseRecord, arguments: argparse.Namespace
+) -> tuple[RigidTransform | None, RigidTransform, Compensation | None]:
+    """machine_from_camera (or None), the work frame machine_from_part, the compensation (or None)."""
+    from vanejax.machine.controllers import Compensation, read_frame
+
+    machine_from_part = record.part_from_camera.inverse()
+    machine_from_camera = None
+    if arguments.camera_pose is not None:
+        machine_from_camera = read_frame(arguments.camera_pose, target="machine", source="camera")
+        machine_from_part = machine_from_camera @ machine_from_part
+    compensation = None
+    if arguments.nominal is not None:
+        nominal = read_frame(arguments.nominal, target="machine", source="part")
+        compensation = Compensation(machine_from_part, nominal)
+    return machine_from_camera, machine_from_part, compensation
+
+
+def _part(record: PoseRecord, arguments: argparse.Namespace) -> Part | None:
+    """That of ``--part``, if the pose is one of it."""
+    if arguments.cad is None:
+        return None
+    part = workpiece.load_workpiece(arguments, must_be_closed=False)
+    if record.part_sha256 not in (None, part.sha256):
+        raise InputError(
+            f"--part {arguments.cad}: is not the part of {arguments.pose} (another sha256); "
+            "give the CAD file that was registered"
+        )
+    return part
+
+
+def _places(
+    record: PoseRecord,
+    arguments: argparse.Namespace,
+    machine_from_camera: RigidTransform | None,
+    machine_from_part: RigidTransform,
+    part: Part | None,
+    path: ToolPath | None,
+) -> list[cut_summary.Place]:
+    """How well the part and the tool tip are known; none where the pose's error is not."""
+    if record.covariance is None:
+        if arguments.max_uncertainty_mm is not None:
+            raise InputError(
+                f"--max-uncertainty-mm: {arguments.pose} has no covariance; write it again with "
+                "`vanejax register --json`"
+            )
+        return []
+    camera = None
+    if arguments.camera_sigma is not None:
+        from vanejax.machine.motion_covariance import MotionCovariance
+
+        mm, deg = parse_mm_deg(arguments.camera_sigma, option="--camera-sigma")
+        origin = machine_from_camera.translation
+        camera = MotionCovariance.alike(origin, sigma_mm=mm, sigma_deg=deg)
+    return cut_summary.places(record.covariance, camera, machine_from_part, part, path)
+
+
+def _too_uncertain(
+    place: cut_summary.Place, record: PoseRecord, arguments: argparse.Namespace
+) -> str | None:
+    """Why a place is not known well enough; None where it is."""
+    from vanejax.localization.verdict import Limits
+
+    most_mm = arguments.max_uncertainty_mm or record.tolerance_mm or Limits().tolerance_mm
+    return cut_summary.refusal(place, most_mm, record.form)
+
+
+def _notes(record: PoseRecord, arguments: argparse.Namespace) -> list[str]:
+    """What was assumed, and what is not known."""
+    notes = []
+    if record.verdict is None:
+        notes.append("the pose has no verdict: nobody checked it")
+    elif record.verdict.status != "accepted":
+        notes.append(f"the pose is {record.verdict.status}: {record.verdict.reason}")
+    if arguments.camera_pose is None:
+        notes.append("the scan's frame is taken to be the machine's (no --camera-pose)")
+    return [*notes, *cut_summary.notes(record)]
 
 
 def _work_frame(machine_from_part: RigidTransform, chosen: str, part: Part | None) -> list[str]:
@@ -217,22 +312,15 @@ def _signed(vector: np.ndarray, digits: int) -> str:
 
 def _tool_path(
     arguments: argparse.Namespace,
+    path: ToolPath,
+    moved: ToolPath,
     machine_from_part: RigidTransform,
     compensation: Compensation | None,
     part: Part | None,
 ) -> list[str]:
-    """Moves the path, writes it, and says how it lies to the part where that is given."""
-    from vanejax.machine.controllers import Compensation
-    from vanejax.machine.tool_path import (
-        compensate,
-        read_tool_path,
-        tool_path_deviation,
-        write_tool_path,
-    )
+    """Writes the moved path, and says how it lies to the part where that is given."""
+    from vanejax.machine.tool_path import tool_path_deviation, write_tool_path
 
-    path = read_tool_path(arguments.tool_path)
-    known = compensation or Compensation(machine_from_part, machine_from_part)
-    moved = compensate(path, known, frame=arguments.path_frame)
     write_tool_path(arguments.out, moved)
     axes = "" if path.axes is None else " with tool axes"
     lines = ["", f"tool path: {len(path.points):,} points{axes}, machine frame: {arguments.out}"]
@@ -252,7 +340,7 @@ def _tool_path(
         )
         near = f"{deviation.share_within:.1%} within {arguments.tolerance_mm:g} mm"
         lines.append(
-            f"  {words + ':':15}off the part as measured by {deviation.mean_mm:.4f} mm on average, "
-            f"{deviation.largest_mm:.4f} mm at most; {near}"
+            f"  {words + ':':15}off the CAD model at the measured pose by {deviation.mean_mm:.4f} "
+            f"mm on average, {deviation.largest_mm:.4f} mm at most; {near}"
         )
     return lines

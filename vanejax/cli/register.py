@@ -17,8 +17,6 @@ from vanejax.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from vanejax.localization.verdict import Limits
-
 EXIT_CODES = {"accepted": 0, "ambiguous": 3, "rejected": 4}
 
 
@@ -105,11 +103,17 @@ def run(arguments: argparse.Namespace) -> int:
 
     started = time.perf_counter()
     origin = parse_sensor_origin(arguments.sensor_origin)
-    limits = parse_tolerance(arguments.tolerance)
+    tolerance_mm, tolerance_deg = parse_mm_deg(arguments.tolerance, option="--tolerance")
     _check_outputs(arguments)
 
+    from vanejax.localization.sensor_calibration import Calibration
+    from vanejax.localization.verdict import Limits
     from vanejax.machine.pose_file import read_pose, write_result
 
+    limits = Limits(tolerance_mm=tolerance_mm, tolerance_deg=tolerance_deg)
+    calibration = None
+    if arguments.calibration is not None:
+        calibration = Calibration.of(arguments.calibration)
     init = None if arguments.init is None else read_pose(arguments.init)
 
     from vanejax.scans.scan_file import load_scan
@@ -141,7 +145,7 @@ def run(arguments: argparse.Namespace) -> int:
         limits=limits,
         max_allowance_mm=arguments.max_allowance_mm,
         form_tolerance_mm=arguments.form_tolerance_mm,
-        calibration=arguments.calibration,
+        calibration=calibration,
         sensor=arguments.sensor,
         seed=arguments.seed,
     )
@@ -162,6 +166,8 @@ def run(arguments: argparse.Namespace) -> int:
             part_sha256=part.sha256,
             seed=arguments.seed,
             weights_name=arguments.weights and Path(arguments.weights).name,
+            calibration_name=arguments.calibration,
+            limits=limits,
         )
     if arguments.report is not None:
         from vanejax.report import write_report
@@ -191,14 +197,12 @@ def parse_sensor_origin(text: str) -> str | np.ndarray:
     return np.array(values)
 
 
-def parse_tolerance(text: str) -> Limits:
-    """Limits of a verdict from ``0.1mm,0.05deg``.
+def parse_mm_deg(text: str, *, option: str) -> tuple[float, float]:
+    """A length in mm and an angle in degrees from ``0.1mm,0.05deg``.
 
     Raises:
-      InputError: anything else.
+      InputError: anything else, or one that is not above 0; names the option.
     """
-    from vanejax.localization.verdict import Limits
-
     found = re.fullmatch(r"\s*([\d.e+-]+)\s*mm\s*,\s*([\d.e+-]+)\s*deg\s*", text)
     try:
         values = [float(word) for word in found.groups()] if found else []
@@ -206,9 +210,9 @@ def parse_tolerance(text: str) -> Limits:
         values = []
     if len(values) != 2 or not all(0 < value < math.inf for value in values):
         raise InputError(
-            f"--tolerance {text}: should be two lengths above 0, such as 0.1mm,0.05deg"
+            f"{option} {text}: should be a length and an angle above 0, such as 0.1mm,0.05deg"
         )
-    return Limits(tolerance_mm=values[0], tolerance_deg=values[1])
+    return values[0], values[1]
 
 
 def wants_color() -> bool:

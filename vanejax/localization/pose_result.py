@@ -17,6 +17,7 @@ from vanejax.rigid import RigidTransform
 
 BOUND = 1.96  # standard deviations: 95 %
 Status = Literal["accepted", "ambiguous", "rejected"]
+FieldKind = Literal["none", "form", "displacement", "range", "facing"]
 
 
 class PointStatus(enum.IntEnum):
@@ -102,7 +103,7 @@ class FormDeviation:
     scale_sigma: float = 0.0
     focal_error: float = 0.0
     focal_sigma: float = 0.0
-    field: str = "none"
+    field: FieldKind = "none"
     field_mm: float = 0.0
     field_length_mm: float = 0.0
     unexplained_share: float = 0.0

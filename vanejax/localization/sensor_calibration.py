@@ -9,7 +9,7 @@ import numpy as np
 from vanejax.errors import InputError
 from vanejax.scanner.camera import Camera
 from vanejax.scanner.range_errors import Lens, Trueness
-from vanejax.scanner.sensor import Sensor, preset
+from vanejax.scanner.sensor import PRESETS, Sensor, preset
 from vanejax.scans.measured_scan import MeasuredScan
 
 NEAR_MM = 1e-6  # of the sensor's origin: the scan's frame is the camera's
@@ -34,9 +34,16 @@ class Calibration:
         """That of a virtual sensor, or of one of `vanejax.scanner.sensor.PRESETS` by name.
 
         Raises:
-          InputError: no such name.
+          InputError: no such name, or a sensor of whose calibration nothing is known.
         """
+        name = f"sensor {sensor!r}" if isinstance(sensor, str) else "the sensor"
         sensor = preset(sensor) if isinstance(sensor, str) else sensor
+        if sensor.lens is None and sensor.trueness is None:
+            known = [n for n, make in PRESETS.items() if make().lens or make().trueness]
+            raise InputError(
+                f"{name} has no errors of calibration that could count; give one whose are known: "
+                f"{', '.join(known)}"
+            )
         return cls(sensor.camera, sensor.lens or Lens(), sensor.trueness or Trueness())
 
     def check_frame(self, scan: MeasuredScan) -> None:

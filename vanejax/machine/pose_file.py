@@ -14,14 +14,15 @@ import re
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
 from vanejax.files import write_json
-from vanejax.localization.pose_result import PointStatus, PoseResult, Status, Verdict
+from vanejax.localization.pose_result import PointStatus, PoseResult
+from vanejax.localization.verdict import Limits
 from vanejax.rigid import MATRIX_TOLERANCE, RigidTransform, rigid_from_matrix
 
 FORMAT = "vanejax pose"
@@ -85,12 +86,23 @@ def result_to_dict(
     part_sha256: str,
     seed: int | None = None,
     weights_name: str | None = None,
+    calibration_name: str | None = None,
+    limits: Limits | None = None,
 ) -> dict[str, Any]:
     """A registration's result without its points, as values that JSON can hold.
 
-    A number that is not finite becomes None. ``part_sha256`` is `Part.sha256`, ``weights_name``
-    the trained matcher's file.
+    A number that is not finite becomes None.
+
+    Args:
+      result: of the registration.
+      scan_name, part_name: of the files.
+      part_sha256: `Part.sha256`.
+      seed: that it was given.
+      weights_name: the trained matcher's file.
+      calibration_name: the sensor whose errors of calibration count in the covariance.
+      limits: that the verdict used.
     """
+    limits = limits or Limits()
     alternatives = [
         pose_to_dict(other.part_from_camera)
         | {
@@ -113,6 +125,8 @@ def result_to_dict(
             "part": {"name": part_name, "sha256": part_sha256},
             "seed": seed,
             "weights": weights_name,
+            "calibration": calibration_name,
+            "tolerance": {"mm": limits.tolerance_mm, "deg": limits.tolerance_deg},
             "verdict": {"status": result.verdict.status, "reason": result.verdict.reason},
             **pose_to_dict(result.part_from_camera),
             "uncertainty": {
@@ -159,32 +173,6 @@ def result_to_dict(
 def write_result(path: str | os.PathLike[str], result: PoseResult, **names: Any) -> None:
     """Writes `result_to_dict` (with the same arguments) as JSON, which `read_pose` reads again."""
     write_json(path, result_to_dict(result, **names), allow_nan=False)
-
-
-class PoseRecord(NamedTuple):
-    """What a pose file (f64, mm) says; verdict and `Part.sha256` are None where it has none."""
-
-    part_from_camera: RigidTransform
-    verdict: Verdict | None
-    part_sha256: str | None
-
-
-def read_record(path: str | os.PathLike[str]) -> PoseRecord:
-    """`read_pose`, with the verdict where the file has one; `InputError` for an unknown one."""
-    path = Path(path)
-    text = read_text(path)
-    pose = parse_transform(text, where=str(path))
-    values = json.loads(text) if text.lstrip()[:1] == "{" else {}
-    verdict, part = values.get("verdict"), values.get("part")
-    if verdict is not None:
-        if not isinstance(verdict, dict) or verdict.get("status") not in get_args(Status):
-            raise InputError(
-                f"{path}: its verdict has no status {', '.join(get_args(Status))}; "
-                "write it again with `vanejax register --json`"
-            )
-        verdict = Verdict(verdict["status"], str(verdict.get("reason") or "no reason is given"))
-    sha256 = part.get("sha256") if isinstance(part, dict) else None
-    return PoseRecord(pose, verdict, sha256 if isinstance(sha256, str) else None)
 
 
 def read_pose(path: str | os.PathLike[str]) -> RigidTransform:
