@@ -182,7 +182,7 @@ def _refusal(record: PoseRecord, arguments: argparse.Namespace) -> int:
 def _frames(
     record: PoseRecord, arguments: argparse.Namespace
 ) -> tuple[RigidTransform | None, RigidTransform, Compensation | None]:
-    """machine_from_camera (or None), the work frame machine_from_part, the compensation (or None)."""
+    """machine_from_camera if given, the work frame, and the compensation if there is a nominal."""
     from vanejax.machine.controllers import Compensation, read_frame
 
     machine_from_part = record.part_from_camera.inverse()
