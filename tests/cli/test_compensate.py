@@ -377,3 +377,5 @@ def test_the_page_names_every_formula_and_option() -> None:
             assert formula in PAGE, formula
     for option in ("--camera-pose", "--nominal", "--format", "--accept-verdict", "--tool-path"):
         assert option in PAGE
+    for option in ("--camera-sigma", "--max-uncertainty-mm"):
+        assert option in PAGE
