@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -20,10 +21,11 @@ import vanejax.localization.registration
 import vanejax.report
 import vanejax.training.export
 from vanejax.cad import Part, guide_vane, part_from_mesh
-from vanejax.cli.pose_summary import verdict_line
+from vanejax.cli.pose_summary import summary, verdict_line
 from vanejax.cli.program import main
 from vanejax.cli.register import wants_color
 from vanejax.cli.scan import parse_views
+from vanejax.localization.pose_result import FormDeviation
 from vanejax.machine.pose_file import pose_to_dict, read_pose
 from vanejax.scanner import Camera, Scanner, hemisphere_viewpoints
 from vanejax.scans.scan_file import load_scan
@@ -113,6 +115,26 @@ def test_the_summary_has_the_figures(files, fake, capsys) -> None:
         assert words in out
 
 
+@pytest.mark.parametrize(
+    ("form", "line"),
+    [
+        (None, None),
+        (FormDeviation(), "no difference from the CAD model shows"),
+        (FormDeviation(is_told=False), "unknown: too little smooth surface was measured"),
+        (
+            FormDeviation(stock_mm=0.5026, stock_sigma_mm=0.0025, field="form", field_mm=0.1),
+            "stock 0.503 +- 0.003 mm; the surface varies by 0.1 mm",
+        ),
+    ],
+)
+def test_the_form_has_one_line(form: FormDeviation | None, line: str | None) -> None:
+    result = example_result()
+    refinement = dataclasses.replace(result.refinement, form=form)
+    text = summary(dataclasses.replace(result, refinement=refinement), color=False, seconds={})
+    found = [words[6:].strip() for words in text.splitlines() if words.startswith("  form ")]
+    assert found == ([] if line is None else [line])
+
+
 def test_what_is_not_known_is_said(files, fake, capsys) -> None:
     fake(example_result(sensor=False))
     assert register(files, "--sensor-origin", "unknown") == 0
@@ -173,7 +195,9 @@ def test_json_and_report_are_written(files, fake, capsys, monkeypatch, tmp_path,
     result = example_result("ambiguous")
     fake(result)
     reports = []
-    monkeypatch.setattr(vanejax.report, "write_report", lambda *given: reports.append(given))
+    monkeypatch.setattr(
+        vanejax.report, "write_report", lambda *given, limits: reports.append(given)
+    )
     outputs = ["--json", tmp_path / "pose.json", "--report", tmp_path / "report.html"]
     asked = ["--calibration", "paper_camera", "--tolerance", "0.2mm,0.1deg"]
     assert register(files, *outputs, *asked) == 3

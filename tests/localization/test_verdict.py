@@ -195,8 +195,8 @@ def test_what_the_part_differs_by_is_named_with_its_figure():
     form = FormDeviation(scale_error=-0.0101, scale_sigma=0.0001, focal_error=0.003)
     found = verdict(form=form, uncertainty={"weakest_translation_sigma_mm": 2.0})
     assert found.status == "ambiguous"
-    assert "1.01% +- 0.01% smaller than the CAD model" in found.reason
-    assert "focal length is off by +0.30%" in found.reason
+    assert "1.010% +- 0.010% smaller than the CAD model" in found.reason
+    assert "focal length is off by +0.300%" in found.reason
     assert "check the camera on a gauge" in found.reason
 
 

@@ -45,6 +45,8 @@ AREAS = {  # filled side by side: must differ in lightness too
     "matches": (canvas.RIGHT, canvas.WRONG, canvas.CAD),
     "verdicts": tuple(canvas.VERDICTS.values()),
     "statuses": tuple(STATUS_COLORS.values()),
+    "deviations": (canvas.FAR_BELOW, "#3b4cc0", "#dddddd"),  # beyond, the end, none
+    "deviations above": (canvas.FAR_ABOVE, "#b40426", "#dddddd"),
     "reasons": tuple(REASON_COLORS.values()),
 }
 
@@ -103,6 +105,11 @@ def test_series_differ_for_every_eye() -> None:
 def test_the_report_has_the_same_colours() -> None:
     style = source("page.css")
     names = {"scan": canvas.SCAN, "cad": canvas.CAD, "hidden": canvas.HIDDEN}
-    names |= {"lost": canvas.NO_PARTNER, "accepted": canvas.VERDICTS["accepted"]}
+    names |= {
+        "lost": canvas.NO_PARTNER,
+        "faint": canvas.FAINT,
+        "accepted": canvas.VERDICTS["accepted"],
+    }
+    names |= {"far-below": canvas.FAR_BELOW, "far-above": canvas.FAR_ABOVE}
     for name, color in names.items():
         assert f"--{name}: {color};" in style

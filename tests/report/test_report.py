@@ -20,10 +20,12 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.cad import Part
 from vanejax.errors import InputError
+from vanejax.localization import Limits
+from vanejax.localization.pose_result import FormDeviation
 from vanejax.plotting.canvas import SCAN
 from vanejax.report import write_report
 from vanejax.report.viewer import MAX_POINTS, simplified, viewer
-from vanejax.report.wording import degrees, direction, fixed, millimetres, percent
+from vanejax.report.wording import degrees, direction, fixed, millimetres, percent, plus_minus
 from vanejax.rigid import RigidTransform
 from vanejax.scans import MeasuredScan
 
@@ -207,6 +209,53 @@ def test_a_result_with_nothing_in_it_is_reported(tmp_path):
     assert "only the sum or difference" in text
 
 
+def with_form(form: FormDeviation | None) -> Registration:
+    case = example_registration()
+    return case.replace(refinement=dataclasses.replace(case.result.refinement, form=form))
+
+
+def test_the_form_has_a_section_with_figures(tmp_path):
+    form = FormDeviation(
+        stock_mm=0.5026, stock_sigma_mm=0.0025, scale_error=-0.0101, scale_sigma=0.0001,
+        field="facing", field_mm=0.16, field_length_mm=29.0, unexplained_share=0.02,
+        beyond_edges_share=0.004, converged=False,
+    )  # fmt: skip
+    page = Page(write(with_form(form), tmp_path))
+    assert ("section", {"class": "card", "id": "form"}) in page.elements
+    for words in (
+        "0.503 ± 0.003 mm", "1.010 ± 0.010 % smaller", "0.16 mm over 29 mm", "2.0 %", "0.4 %",
+        "stock on a few faces", "did not converge",
+        "Found: stock 0.503 ± 0.003 mm; the scan is", "Without stock and the difference of size",
+        "Each colour is drawn where the sensor should have met the CAD model.",
+    ):  # fmt: skip
+        assert words in page.text, words
+    images = [a["alt"] or "" for t, a in page.elements if t == "img"]
+    assert sum(words.startswith("Signed deviations") for words in images) == 4
+
+
+@pytest.mark.parametrize(
+    ("form", "words"),
+    [
+        (None, "Nobody asked how the part differs"),
+        (FormDeviation(is_told=False), "Too little smooth surface was measured"),
+        (FormDeviation(), "Stock no uniform offset that the scan shows none found"),
+    ],
+)
+def test_no_form_is_not_a_form_without_deviation(tmp_path, form, words):
+    text = Page(write(with_form(form), tmp_path)).text
+    assert words in text
+    assert "Found:" not in text
+    assert ("as designed" in text) == (form == FormDeviation())
+
+
+def test_the_bounds_are_beside_what_the_job_needs(tmp_path):
+    # weakest sigmas 0.0017 deg and 0.003 mm
+    limits = Limits(tolerance_deg=0.002, tolerance_mm=0.05)
+    text = Page(write(example_registration(), tmp_path, limits=limits)).text
+    assert "Rotation 0.0034° 0.0020° no" in text
+    assert "Position 0.0059 mm 0.050 mm yes" in text
+
+
 def test_many_alternatives_have_few_pictures(tmp_path):
     case, count = example_registration("ambiguous"), 9
     other = case.result.alternatives[0]
@@ -225,6 +274,9 @@ def test_many_alternatives_have_few_pictures(tmp_path):
         (percent(0.97), "97.0 %"), (percent(1e-5), "< 0.1 %"), (percent(0.99999), "> 99.9 %"),
         (percent(1.0), "100.0 %"), (percent(0.0), "0.0 %"), (percent(float("nan")), "unknown"),
         (fixed(-1.25, 2), "−1.25"), (fixed(-1e-9, 4), "0.0000"),
+        (plus_minus(0.502596, 0.002519), "0.503 ± 0.003"), (plus_minus(-1.2, 0.96), "−1.2 ± 1.0"),
+        (plus_minus(1.00184, 0.00171), "1.0018 ± 0.0017"), (plus_minus(0.2, 0.0), "0.200"),
+        (plus_minus(12.3, 16.0), "12 ± 16"),
         (direction(np.array([0, 0.1, -5.0])), "the part's z axis"),
         (direction(np.array([-1, 0, 1.01])),
          "the direction (−0.70, 0.00, 0.71), between the part's z and −x axes"),

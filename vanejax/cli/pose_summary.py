@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from vanejax.localization.pose_result import PoseResult, Verdict
+    from vanejax.localization.pose_result import FormDeviation, PoseResult, Verdict
 
 _COLORS = {"accepted": "32", "ambiguous": "33", "rejected": "31"}
 _WIDTH = 100
@@ -30,12 +30,10 @@ def summary(result: PoseResult, *, color: bool, seconds: Mapping[str, float]) ->
       color: whether the terminal takes colours.
       seconds: of each stage, in order; the whole last.
     """
-    from vanejax.localization.verdict import in_words
     from vanejax.machine.pose_file import pose_to_dict
 
     numbers = pose_to_dict(result.part_from_camera)["part_from_camera_as"]
     uncertainty, checks, refinement = result.uncertainty, result.verification, result.refinement
-    differences = list(in_words(refinement.form)) or ["no difference from the CAD model shows"]
     ended = "converged" if refinement.converged else "NOT CONVERGED"
     lines = [
         verdict_line(result.verdict, color=color),
@@ -59,7 +57,8 @@ def summary(result: PoseResult, *, color: bool, seconds: Mapping[str, float]) ->
         f"{refinement.iterations} iterations, {ended}, "
         f"{refinement.num_inliers:,} of {refinement.num_points:,} points",
     ]
-    lines += [f"  {'form' if k == 0 else '':<12} {words}" for k, words in enumerate(differences)]
+    if refinement.form is not None:
+        lines.append(f"  form         {_form(refinement.form)}")
     if result.alternatives:
         lines.append("alternatives (from the pose above)")
     for number, other in enumerate(result.alternatives, 1):
@@ -73,6 +72,15 @@ def summary(result: PoseResult, *, color: bool, seconds: Mapping[str, float]) ->
         ) or ["note:"]
     lines.append("time: " + ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
     return "\n".join(lines)
+
+
+def _form(form: FormDeviation) -> str:
+    """How the part differs from its CAD model, in one line."""
+    from vanejax.localization.verdict import in_words
+
+    if not form.is_told:
+        return "unknown: too little smooth surface was measured"
+    return "; ".join(in_words(form)) or "no difference from the CAD model shows"
 
 
 def _row(values: Sequence[float]) -> str:

@@ -172,7 +172,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.report is not None:
         from vanejax.report import write_report
 
-        write_report(arguments.report, result, scan, part)
+        write_report(arguments.report, result, scan, part, limits=limits)
     return EXIT_CODES[result.verdict.status]
 
 

@@ -16,6 +16,7 @@ from vanejax.localization.form_deviation import as_designed, scaled_pose
 from vanejax.localization.pose_batch import concatenate, distances, distinct, is_same, select, stack
 from vanejax.localization.pose_result import (
     Alternative,
+    FormDeviation,
     Refinement,
     Uncertainty,
     Verdict,
@@ -209,15 +210,34 @@ def _verify(
     seed: int,
 ) -> Verification:
     """What the points say: of a casting, whether the part is there under its stock."""
-    pose, form = refinement.part_from_camera, refinement.form
     checked = subset(points, VERIFIED_POINTS, seed + 3)
+    form = refinement.form
+    model, points, pose = without_form_deviation(model, points, refinement.part_from_camera, form)
     if form is not None and not form.is_as_designed:
-        terms = np.array([form.stock_mm, form.scale_error, form.focal_error])
-        pose = scaled_pose(pose, model.part.center, 1 / (1 + form.scale_error))
-        model, points = as_designed(model, points, pose, terms)
         tolerance_mm = float(inlier_tolerance_mm(model, stack(pose), points[checked])[0])
     view = view_of(model, points[checked])
     return verify(model, pose, points, checked, tolerance_mm=tolerance_mm, view=view)
+
+
+def without_form_deviation(
+    model: MeasurementModel,
+    points: np.ndarray,
+    part_from_camera: RigidTransform,
+    form: FormDeviation | None,
+) -> tuple[MeasurementModel, np.ndarray, RigidTransform]:
+    """Model, points [N, 3] mm and pose as if the part had no stock and everything its true size.
+
+    Args:
+      model: of the scan as it is.
+      points: [N, 3] f64, mm, camera frame.
+      part_from_camera: the pose of the scan as it is.
+      form: its stock, scale and focal length are taken out; the smooth field stays.
+    """
+    if form is None or form.is_as_designed:
+        return model, points, part_from_camera
+    terms = np.array([form.stock_mm, form.scale_error, form.focal_error])
+    pose = scaled_pose(part_from_camera, model.part.center, 1 / (1 + form.scale_error))
+    return *as_designed(model, points, pose, terms), pose
 
 
 def _is_near_guess(

@@ -108,12 +108,12 @@ def in_words(form: FormDeviation | None) -> Iterator[str]:
     if form.scale_error:
         word = "larger" if form.scale_error > 0 else "smaller"
         yield (
-            f"the scan is {abs(form.scale_error):.2%} +- {form.scale_sigma:.2%} {word} than the "
+            f"the scan is {abs(form.scale_error):.3%} +- {form.scale_sigma:.3%} {word} than the "
             "CAD model"
         )
     if form.focal_error:
         yield (
-            f"the camera's focal length is off by {form.focal_error:+.2%} +- {form.focal_sigma:.2%}"
+            f"the camera's focal length is off by {form.focal_error:+.3%} +- {form.focal_sigma:.3%}"
         )
     if form.field != "none":
         what = {

@@ -32,6 +32,7 @@ RIGHT, WRONG = INK, "#d55e00"  # matches
 VERDICTS = {"accepted": "#0072b2", "ambiguous": "#e69f00", "rejected": "#8c2d04"}
 NO_PARTNER = "#e3c800"  # a point without a surface to deviate from
 DEVIATION_COLORMAP = "coolwarm"  # blue below the surface, red above it, grey on it
+FAR_BELOW, FAR_ABOVE = "#0b1640", "#4a0010"  # beyond the ends of these colours
 ERROR_COLORMAP = "YlGnBu"  # what has no sign: darker is more
 SERIES = ("#0072b2", "#e69f00", "#882255", "#56b4e9", "#d55e00", "#009e73")
 MARKERS = ("o", "s", "^", "D", "v", "P")  # of the series: not by colour alone
@@ -109,13 +110,13 @@ def add_legend(owner: Axes | Figure, handles: Sequence[Artist] | None = None, **
     )  # fmt: skip
 
 
-def name_colors(figure: Figure, colors: Mapping[str, str]) -> None:
-    """A legend of dots below the panels: what each colour means."""
+def name_colors(figure: Figure, colors: Mapping[str, str], *, columns: int | None = None) -> None:
+    """A legend of dots below the panels: what each colour means; in one row if no columns."""
     dots = [
         Line2D([], [], marker="o", markersize=6, linestyle="", color=color, label=name)
         for name, color in colors.items()
     ]
-    add_legend(figure, dots, loc="outside lower center", ncols=len(dots))
+    add_legend(figure, dots, loc="outside lower center", ncols=columns or len(dots))
 
 
 def add_color_bar(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import textwrap
+from typing import NamedTuple
+
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
@@ -9,7 +12,11 @@ from matplotlib.colors import Colormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 
 from vanejax.cad import Part
-from vanejax.localization.pose_result import PointStatus, PoseResult, Verification
+from vanejax.localization.assessment import without_form_deviation
+from vanejax.localization.pose_batch import stack
+from vanejax.localization.pose_result import FormDeviation, PointStatus, PoseResult, Verification
+from vanejax.localization.residuals import MeasurementModel, RayCasting, measurement_model
+from vanejax.localization.verdict import in_words
 from vanejax.plotting import canvas
 from vanejax.plotting.scene import Picture, Scene, reader_rotation, show
 from vanejax.plotting.shading import crop_size, draw_part, shade
@@ -24,8 +31,11 @@ STATUS_COLORS = {
     PointStatus.BESIDE: canvas.NO_PARTNER,
 }
 # the second look on the same scan: far enough round to see what the first one foreshortens
-OBLIQUE_YAW_DEG, OBLIQUE_PITCH_DEG = 48.0, 18.0
+_OBLIQUE_DEG = {"yaw_deg": 48.0, "pitch_deg": 18.0}
+_LIFT = 0.005  # of the part's radius: little enough to hide behind the thinnest wall
+UNMEASURED = canvas.FAINT  # of the part: darker than the grey of no deviation
 _PANEL_IN = 3.2
+_TITLE_CHARACTERS = 105
 _MAX_DOTS = 100_000
 # of the picture of a casting
 _PIXELS = 900
@@ -35,34 +45,84 @@ _REACH_MM = 4.0  # no casting is off by half of it
 _SAME_FACE = 0.9  # cosine: the CAD face under a point of the casting, not the one round an edge
 
 
+class DeviationMaps(NamedTuple):
+    """Pictures of a scan's deviations from the CAD surface, drawn on that surface.
+
+    Attributes:
+      titles: of the maps: one, or two where the part has stock or another size: as measured, and
+        without these.
+      sides: from where they are seen.
+      pictures: of each side a picture for each map.
+      limit_mm: where the colours of all of them end.
+      below_share, above_share: of the checked points, those beyond the colours in the last map: no
+        difference that was found explains them.
+      lost_share: of the checked points, those without a partner on the part.
+    """
+
+    titles: tuple[str, ...]
+    sides: tuple[str, ...]
+    pictures: tuple[tuple[Picture, ...], ...]
+    limit_mm: float
+    below_share: float
+    above_share: float
+    lost_share: float
+
+
 def deviation_map(result: PoseResult, scan: MeasuredScan, part: Part) -> Figure:
     """Signed distance of the checked points to the CAD surface, from two sides.
+
+    Where the part has stock, or the scan another size, a second map shows what is left without
+    them, beside the first in the same colours; the title names what was found.
 
     Args:
       result: with `Verification.deviation_mm`; points without a partner get a colour of their own.
       scan: what was registered.
       part: to what.
     """
-    pictures = deviation_pictures(result, scan, Scene(part))
-    limit = color_limit_mm(result.verification)
-    mm_per_in = sum(picture.width_mm for picture in pictures) / (2 * _PANEL_IN)
-    high = max(picture.width_mm * picture.height_per_width for picture in pictures) / mm_per_in
-    figure = canvas.new_figure(canvas.WIDTH_IN, high + 0.6)
-    # one scale for both
-    panels = figure.subplots(1, 2, width_ratios=[picture.width_mm for picture in pictures])
-    for axes, picture, title in zip(
-        panels, pictures, ("from the sensor's side", "from further left and above"), strict=True
-    ):
+    maps = deviation_maps(result, scan, Scene(part))
+    if len(maps.titles) == 1:
+        rows, titles = [[picture for (picture,) in maps.pictures]], maps.sides
+    else:
+        rows = maps.pictures
+        titles = [f"{title}\n{side}" for side in maps.sides for title in maps.titles]
+    # one scale for all
+    widths = np.max([[picture.width_mm for picture in row] for row in rows], axis=0)
+    heights = [max(picture.width_mm * picture.height_per_width for picture in row) for row in rows]
+    mm_per_in = sum(widths) / (2 * _PANEL_IN)
+    figure = canvas.new_figure(canvas.WIDTH_IN, sum(heights) / mm_per_in + 0.4 + 0.3 * len(rows))
+    panels = figure.subplots(
+        len(rows), 2, squeeze=False, width_ratios=widths, height_ratios=heights
+    )
+    pictures = [picture for row in rows for picture in row]
+    for axes, picture, title in zip(panels.flat, pictures, titles, strict=True):
         show(axes, picture)
         canvas.name_panel(axes, title)
-    scale = ScalarMappable(Normalize(-limit, limit), colormaps[canvas.DEVIATION_COLORMAP])
+    found = "; ".join(in_words(result.refinement.form)).replace("+-", "±")
+    if found:
+        words = "\n".join(textwrap.wrap(found, _TITLE_CHARACTERS))
+        figure.suptitle(words, fontsize=canvas.TITLE_PT, color=canvas.INK)
+    scale = ScalarMappable(Normalize(-maps.limit_mm, maps.limit_mm), deviation_colormap())
     label = "deviation from the CAD surface (mm)\n+ outside the material"
-    canvas.add_color_bar(figure, panels, scale, label, fraction=0.025, extend="both")
-    lost = np.count_nonzero(np.isnan(result.verification.deviation_mm))
-    if lost:
-        share = 100 * lost / len(result.verification.deviation_mm)
-        canvas.name_colors(figure, {f"no partner on the part ({share:.1f} %)": canvas.NO_PARTNER})
+    bar = canvas.add_color_bar(figure, panels, scale, label, fraction=0.025, extend="both")
+    bar.set_ticks(maps.limit_mm * np.linspace(-1, 1, 5))
+    canvas.name_colors(figure, _legend(maps), columns=2 if len(maps.titles) > 1 else None)
     return figure
+
+
+def _legend(maps: DeviationMaps) -> dict[str, str]:
+    """What the colours beside those of the bar mean; shares are of the last map."""
+    where = " in the right map" if len(maps.titles) > 1 else ""
+    shares = {
+        f"> {maps.limit_mm:g} mm below": (maps.below_share, canvas.FAR_BELOW),
+        f"> {maps.limit_mm:g} mm outside": (maps.above_share, canvas.FAR_ABOVE),
+        "no partner": (maps.lost_share, canvas.NO_PARTNER),
+    }
+    named = {
+        f"{name}: {'< 0.1' if share < 5e-4 else f'{100 * share:.1f}'} %{where}": color
+        for name, (share, color) in shares.items()
+        if share
+    }
+    return named | {"not measured": UNMEASURED}
 
 
 def residual_histogram(result: PoseResult) -> Figure:
@@ -75,7 +135,7 @@ def residual_histogram(result: PoseResult) -> Figure:
     finite = np.isfinite(verification.deviation_mm)
     deviation = verification.deviation_mm[finite]
     status = verification.status[finite]
-    limit = float(np.fmax(1.6 * verification.tolerance_mm, color_limit_mm(verification)))
+    limit = float(np.fmax(1.6 * verification.tolerance_mm, _round_limit_mm(deviation, 98)))
     edges = np.linspace(-limit, limit, 97)
     figure = canvas.new_figure(5.0, 2.9)
     axes = figure.subplots()
@@ -134,10 +194,28 @@ def overlay_before_after(result: PoseResult, scan: MeasuredScan, part: Part) -> 
     return figure
 
 
-def color_limit_mm(verification: Verification) -> float:
-    """Where the colours of deviations end: a round figure that 98 % of them stay below."""
-    deviation = np.abs(verification.deviation_mm[np.isfinite(verification.deviation_mm)])
-    wanted = float(np.percentile(deviation, 98)) if len(deviation) else 0.0
+def color_limit_mm(verification: Verification, measured_mm: np.ndarray | None = None) -> float:
+    """Where the colours of deviations end: a round figure that no inlier is beyond.
+
+    Where there is none, 98 % of all deviations are not beyond it.
+
+    Args:
+      verification: of n points.
+      measured_mm: [n], the same points' deviations with all that the part differs by; 98 % of the
+        inliers' are not beyond the limit either.
+    """
+    finite = np.isfinite(verification.deviation_mm)
+    inlier = finite & (verification.status == PointStatus.INLIER)
+    if not inlier.any():
+        return _round_limit_mm(verification.deviation_mm, 98)
+    limit = _round_limit_mm(verification.deviation_mm[inlier], 100)
+    return limit if measured_mm is None else max(limit, _round_limit_mm(measured_mm[inlier], 98))
+
+
+def _round_limit_mm(deviation_mm: np.ndarray, percent: float) -> float:
+    """A round figure that so many of the deviations stay below."""
+    deviation = np.abs(deviation_mm[np.isfinite(deviation_mm)])
+    wanted = float(np.percentile(deviation, percent)) if len(deviation) else 0.0
     wanted = max(wanted, 1e-3)
     power = 10.0 ** np.floor(np.log10(wanted))
     steps = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
@@ -145,29 +223,110 @@ def color_limit_mm(verification: Verification) -> float:
     return float(power * next(step for step in steps if step * power >= wanted * (1 - 1e-9)))
 
 
+def deviation_colormap() -> Colormap:
+    """The colours of deviations, with those beyond its ends and of what has no partner."""
+    return colormaps[canvas.DEVIATION_COLORMAP].with_extremes(
+        under=canvas.FAR_BELOW, over=canvas.FAR_ABOVE, bad=canvas.NO_PARTNER
+    )
+
+
 def deviation_colors(deviation_mm: np.ndarray, limit_mm: float) -> np.ndarray:
     """Colours [n, 3], 0 to 1, of signed deviations [n] in mm; NaN has a colour of its own."""
     scale = Normalize(-limit_mm, limit_mm)
-    colors = colormaps[canvas.DEVIATION_COLORMAP](scale(deviation_mm))[:, :3]
-    colors[np.isnan(deviation_mm)] = to_rgb(canvas.NO_PARTNER)
-    return colors
+    return deviation_colormap()(scale(np.ma.masked_invalid(deviation_mm)))[:, :3]
 
 
-def deviation_pictures(result: PoseResult, scan: MeasuredScan, scene: Scene) -> tuple[Picture, ...]:
-    """The two pictures of `deviation_map`: as the sensor sees it, and from further round."""
-    verification = result.verification
-    pose = result.part_from_camera
-    some = _choice(len(verification.checked))
-    points = pose.apply(scan.points[verification.checked[some]])
-    colors = deviation_colors(verification.deviation_mm[some], color_limit_mm(verification))
-    # how far below the surface a point is still drawn on it: what noise alone may do
-    lift = verification.tolerance_mm if np.isfinite(verification.tolerance_mm) else 0.0
+def deviation_maps(result: PoseResult, scan: MeasuredScan, scene: Scene) -> DeviationMaps:
+    """The pictures of `deviation_map`: as the sensor sees it, and from further round."""
+    clouds = _clouds(result, scan, scene.part)
+    last = clouds[-1].deviation_mm
+    limit = color_limit_mm(result.verification, clouds[0].deviation_mm)
+    some = _choice(len(last))
+    pose, oblique = result.part_from_camera, dict(_OBLIQUE_DEG)
+    oblique["yaw_deg"] = scene.fuller_side(scan, pose, **oblique)
     pictures = []
-    for yaw, pitch in ((0.0, 0.0), (OBLIQUE_YAW_DEG, OBLIQUE_PITCH_DEG)):
-        reader = reader_rotation(scan, scene.part, pose, yaw_deg=yaw, pitch_deg=pitch)
-        frame = scene.frame(reader, [points])
-        pictures.append(scene.draw(reader, points, colors, frame=frame, lift_mm=lift))
-    return tuple(pictures)
+    for turn in ({}, oblique):
+        reader = reader_rotation(scan, scene.part, pose, **turn)
+        frame = scene.frame(reader, [cloud.points[some] for cloud in clouds])
+        look = {"frame": frame, "part_color": UNMEASURED, "lift_mm": _LIFT * scene.part.radius}
+        row = [
+            scene.draw(
+                reader,
+                cloud.points[some],
+                deviation_colors(cloud.deviation_mm[some], limit),
+                **look,
+            )
+            for cloud in clouds
+        ]
+        pictures.append(tuple(row))
+    side = "left" if oblique["yaw_deg"] > 0 else "right"
+    count = max(len(last), 1)
+    return DeviationMaps(
+        tuple(cloud.title for cloud in clouds),
+        ("from the sensor's side", f"from further {side} and above"),
+        tuple(pictures),
+        limit,
+        below_share=float(np.count_nonzero(last < -limit) / count),
+        above_share=float(np.count_nonzero(last > limit) / count),
+        lost_share=float(np.count_nonzero(np.isnan(last)) / count),
+    )
+
+
+class _Cloud(NamedTuple):
+    """Points [n, 3] mm, part frame, on the CAD surface, and their deviations [n] mm or NaN."""
+
+    title: str
+    points: np.ndarray
+    deviation_mm: np.ndarray
+
+
+def _clouds(result: PoseResult, scan: MeasuredScan, part: Part) -> list[_Cloud]:
+    """The checked points as measured and, where that differs, without stock and size."""
+    verification, form = result.verification, result.refinement.form
+    model = measurement_model(part, result.sensor_origin)
+    points, pose = scan.points[verification.checked], result.part_from_camera
+    names = form_terms(form)
+    place, _, _ = _on_surface(*without_form_deviation(model, points, pose, form))
+    title = f"without {' and '.join(names)}" if names else "as measured"
+    left = _Cloud(title, place, verification.deviation_mm)
+    if not names:
+        return [left]
+    place, deviation, hit = _on_surface(model, points, pose)
+    known = hit | (np.abs(deviation) <= verification.tolerance_mm)
+    return [_Cloud("as measured", place, np.where(known, deviation, np.nan)), left]
+
+
+def form_terms(form: FormDeviation | None) -> tuple[str, ...]:
+    """What of a form can be taken out of a scan, in words."""
+    if form is None:
+        return ()
+    terms = {
+        "stock": form.stock_mm,
+        "the difference of size": form.scale_error,
+        "the error of the focal length": form.focal_error,
+    }
+    return tuple(name for name, value in terms.items() if value)
+
+
+def _on_surface(
+    model: MeasurementModel, points: np.ndarray, pose: RigidTransform
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where on the CAD surface deviations of points [n, 3] mm are from, in the part's frame.
+
+    Below the surface a point would be hidden by it. Also the deviations [n] mm and whether there is
+    such a place [n]; a point without one stays where it is.
+    """
+    if not len(points):
+        return points, np.zeros(0), np.zeros(0, bool)
+    residuals = model.residuals(stack(pose), points)
+    deviation, hit = residuals.deviation_mm[0], residuals.hit[0]
+    if isinstance(model, RayCasting):
+        away = pose.rotate(points - model.sensor_origin)
+        away /= np.linalg.norm(away, axis=1, keepdims=True)
+        along = np.where(hit, deviation / np.maximum(residuals.cosine[0], 1e-6), 0.0)
+    else:
+        away, along = residuals.jacobian[0][:, 3:], np.where(hit, -deviation, 0.0)
+    return pose.apply(points) + along[:, None] * away, deviation, hit
 
 
 def overlay_pictures(
@@ -177,7 +336,7 @@ def overlay_pictures(
 
     All pictures have the same size; ``pixels`` is their longer side.
     """
-    reader = overlay_rotation(scan, scene.part, poses[-1])
+    reader = overlay_rotation(scan, scene, poses[-1])
     some = scan.points[_choice(len(scan.points))]
     clouds = [pose.apply(some) for pose in poses]
     frame = scene.frame(reader, clouds)
@@ -189,10 +348,11 @@ def overlay_pictures(
 
 
 def overlay_rotation(
-    scan: MeasuredScan, part: Part, part_from_camera: RigidTransform
+    scan: MeasuredScan, scene: Scene, part_from_camera: RigidTransform
 ) -> np.ndarray:
     """reader_from_part [3, 3] of overlays: beside the sensor, where errors along its rays show."""
-    return reader_rotation(scan, part, part_from_camera, yaw_deg=28.0, pitch_deg=14.0)
+    yaw = scene.fuller_side(scan, part_from_camera, yaw_deg=28.0, pitch_deg=14.0)
+    return reader_rotation(scan, scene.part, part_from_camera, yaw_deg=yaw, pitch_deg=14.0)
 
 
 def _choice(count: int) -> np.ndarray | slice:

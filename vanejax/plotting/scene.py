@@ -26,6 +26,8 @@ PART_METAL = "#b4bcc8"
 # part radii: a guess may be metres away, and would leave a picture of nothing
 _REACH = 2.5
 _FIELD_DEG = 12.0
+_CLEAR = 0.02  # part radii: farther than noise and stock put a point below its surface
+_SHADOW = 0.4  # light in the shadow, of full light
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -125,6 +127,32 @@ class Scene:
             extent_mm=(box[0, 0], box[1, 0], box[0, 1], box[1, 1]),
         )
 
+    def fuller_side(
+        self,
+        scan: MeasuredScan,
+        part_from_camera: RigidTransform,
+        *,
+        yaw_deg: float,
+        pitch_deg: float,
+    ) -> float:
+        """``yaw_deg`` or its opposite: where the part hides less of the scan from the reader.
+
+        Args:
+          scan: mm.
+          part_from_camera: its pose.
+          yaw_deg, pitch_deg: of `reader_rotation`.
+        """
+        points = part_from_camera.apply(scan.points[:: max(1, len(scan.points) // 2000)])
+        free = {}
+        for yaw in (yaw_deg, -yaw_deg):
+            reader = reader_rotation(
+                scan, self.part, part_from_camera, yaw_deg=yaw, pitch_deg=pitch_deg
+            )
+            towards = np.broadcast_to(reader[2], points.shape)
+            hits = self._scanner.cast(points + _CLEAR * self.part.radius * towards, towards)
+            free[yaw] = np.count_nonzero(hits.face < 0)
+        return max(free, key=free.get)
+
     def _camera_from_part(self, reader_from_part: np.ndarray) -> RigidTransform:
         """The reader as a camera, so far from the part's centre that the whole part is seen."""
         back = np.array([0.0, 0.0, -self._distance_mm])
@@ -210,9 +238,10 @@ def _shaded_part(scan: Scan, camera: Camera, color: str) -> tuple[np.ndarray, np
     grey = shade(scan, camera)
     image = np.zeros((camera.height * camera.width, 4))
     light = grey.reshape(-1, 3)[scan.pixel]
-    # a full light leaves the colour as it is
+    # a full light leaves the colour as it is, and no shadow is so dark that it looks like one
     full = np.percentile(light, 80, axis=0)
-    image[scan.pixel, :3] = np.clip(light / full * np.array(to_rgb(color)), 0, 1)
+    share = _SHADOW + (1 - _SHADOW) * light / full
+    image[scan.pixel, :3] = np.clip(share * np.array(to_rgb(color)), 0, 1)
     image[scan.pixel, 3] = 1.0
     depth = np.full(camera.height * camera.width, np.inf)
     depth[scan.pixel] = -scan.points[:, 2]

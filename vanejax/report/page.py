@@ -16,20 +16,28 @@ from scipy.special import chdtri
 from vanejax.cad import Part
 from vanejax.errors import InputError
 from vanejax.files import write_text
-from vanejax.localization.pose_result import PointStatus, PoseResult, Uncertainty
+from vanejax.localization.pose_result import (
+    FormDeviation,
+    PointStatus,
+    PoseResult,
+    Uncertainty,
+)
+from vanejax.localization.verdict import Limits, in_words
 from vanejax.machine.pose_file import pose_to_dict
 from vanejax.plotting.deviation import (
     STATUS_COLORS,
+    DeviationMaps,
     color_limit_mm,
-    deviation_pictures,
+    deviation_maps,
+    form_terms,
     overlay_pictures,
     residual_histogram,
 )
 from vanejax.plotting.scene import Scene
 from vanejax.report import templates
-from vanejax.report.pictures import figure_uris, image
+from vanejax.report.pictures import Image, figure_uris, image
 from vanejax.report.viewer import viewer
-from vanejax.report.wording import fixed
+from vanejax.report.wording import degrees, fixed, millimetres, percent, plus_minus
 from vanejax.rigid import RigidTransform
 from vanejax.scans import MeasuredScan
 
@@ -43,6 +51,12 @@ _MEANING = {
         "the ray would have gone through material: a free-space violation",
     ),
     PointStatus.BESIDE: ("Beside it", "no partner on the part: surroundings, or a wrong pose"),
+}
+_FIELDS = {
+    "form": "the surface waves along its normal",
+    "displacement": "the part is bent or twisted",
+    "range": "the sensor's range varies",
+    "facing": "faces that look the same way are offset alike: stock on a few faces, or the like",
 }
 _ADVICE = {
     "accepted": "The scan confirms this pose.",
@@ -58,6 +72,7 @@ def write_report(
     part: Part,
     *,
     truth: RigidTransform | None = None,
+    limits: Limits | None = None,
 ) -> None:
     """Writes what was found as one HTML file that needs no network and no other file.
 
@@ -71,6 +86,7 @@ def write_report(
       scan: what was registered; mm, its own frame.
       part: to what.
       truth: part_from_camera, where it is known, as for virtual scans: the error is stated too.
+      limits: of the verdict, as they were given to `vanejax.register`.
 
     Raises:
       InputError: another suffix, a folder that cannot be written, or a result of another scan.
@@ -86,13 +102,20 @@ def write_report(
             f"the result checks point {int(checked.max())}, but the scan {scan.name!r} has "
             f"{len(scan.points)}: it is another scan's result"
         )
-    write_text(path, _html(result, scan, part, truth))
+    write_text(path, _html(result, scan, part, truth, limits or Limits()))
 
 
-def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransform | None) -> str:
+def _html(
+    result: PoseResult,
+    scan: MeasuredScan,
+    part: Part,
+    truth: RigidTransform | None,
+    limits: Limits,
+) -> str:
     """The page's text."""
     scene = Scene(part)
     before, after = overlay_pictures(scan, scene, result.before, result.part_from_camera)
+    maps = deviation_maps(result, scan, scene)
     moved = _difference(result.before, result.part_from_camera, part.center)
     return templates.page(
         "page.html",
@@ -107,10 +130,13 @@ def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransf
         moved_mm=float(np.linalg.norm(moved[3:])),
         before=image(before),
         after=image(after),
-        deviations=[image(p) for p in deviation_pictures(result, scan, scene)],
-        lost=float(np.isnan(result.verification.deviation_mm).mean())
-        if len(result.verification.deviation_mm)
-        else 0.0,
+        form=result.refinement.form,
+        differences=_differences(result.refinement.form),
+        found="; ".join(in_words(result.refinement.form)).replace("+-", "±"),
+        taken_out=" and ".join(form_terms(result.refinement.form)),
+        needs=_needs(result.uncertainty, limits),
+        maps=maps,
+        deviations=_captioned(maps),
         limit_mm=color_limit_mm(result.verification),
         histogram=figure_uris(residual_histogram(result)),
         others=_others(result, scan, scene),
@@ -123,6 +149,67 @@ def _html(result: PoseResult, scan: MeasuredScan, part: Part, truth: RigidTransf
         system=platform.platform(terse=True),
         written=datetime.datetime.now().astimezone().isoformat(sep=" ", timespec="seconds"),
     )
+
+
+def _captioned(maps: DeviationMaps) -> list[tuple[str, Image]]:
+    """The maps, each with what it shows: what is to be compared lies beside each other."""
+    found = []
+    for side, row in zip(maps.sides, maps.pictures, strict=True):
+        for title, picture in zip(maps.titles, row, strict=True):
+            words = side if len(maps.titles) == 1 else f"{title}, {side}"
+            found.append((words[0].upper() + words[1:], image(picture)))
+    return found
+
+
+def _differences(form: FormDeviation | None) -> list[tuple[str, str, str]]:
+    """How the part differs from its CAD model: of each difference its name, figure and meaning."""
+    if form is None or not form.is_told:
+        return []
+    rows = [("Stock", "none found", "no uniform offset that the scan shows")]
+    if form.stock_mm:
+        value = f"{plus_minus(form.stock_mm, form.stock_sigma_mm)} mm"
+        side = "outward" if form.stock_mm > 0 else "inward: too little material"
+        rows = [("Stock", value, f"uniform offset of the surface, {side}")]
+    if form.scale_error:
+        value = plus_minus(100 * abs(form.scale_error), 100 * form.scale_sigma)
+        word = "larger" if form.scale_error > 0 else "smaller"
+        meaning = f"the part is {word}, or the camera's scale is off: one view does not tell"
+        rows.append(("Size", f"{value} % {word}", meaning))
+    else:
+        rows.append(("Size", "as designed", "no difference that the scan shows"))
+    if form.focal_error:
+        value = plus_minus(100 * form.focal_error, 100 * form.focal_sigma)
+        rows.append(("Focal length", f"{value} %", "the camera's calibration is off"))
+    if form.field == "none":
+        rows.append(
+            ("Smooth deviation", "none found", "no wave, bend or twist that the scan shows")
+        )
+    else:
+        length = f" over {form.field_length_mm:.0f} mm" if form.field_length_mm else ""
+        value = f"{millimetres(form.field_mm)}{length}"
+        rows.append(("Smooth deviation", value, f"σ; {_FIELDS[form.field]}"))
+    if form.unexplained_share:
+        share = percent(form.unexplained_share)
+        meaning = "of the patches of the scan: missing or extra material, or other things"
+        rows.append(("Not explained", share, meaning))
+    if form.beyond_edges_share:
+        share = percent(form.beyond_edges_share)
+        why = "as stock or size make them"
+        if not (form.stock_mm or form.scale_error):
+            why = "stock on one side, or something that touches the part"
+        rows.append(("Beyond the edges", share, f"of the points, by less than 3 mm: {why}"))
+    return rows
+
+
+def _needs(uncertainty: Uncertainty, limits: Limits) -> list[tuple[str, str, str, str]]:
+    """Of the rotation and of the position: 95 % bound, what the job needs, and whether it is so."""
+    rows = []
+    for name, bound, least, words in (
+        ("Rotation", uncertainty.rotation_bound_deg, limits.tolerance_deg, degrees),
+        ("Position", uncertainty.translation_bound_mm, limits.tolerance_mm, millimetres),
+    ):
+        rows.append((name, words(bound), words(least), "yes" if bound <= least else "no"))
+    return rows
 
 
 def _advice(result: PoseResult) -> str:

@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
-from vanejax.plotting.canvas import DEVIATION_COLORMAP, FAINT, GRID, INK
+from vanejax.plotting.canvas import DEVIATION_COLORMAP, FAINT, FAR_ABOVE, FAR_BELOW, GRID, INK
 from vanejax.plotting.scene import Picture, scale_bar_mm
 
 _ON_DARK = {INK: "#e6e8eb", FAINT: "#8a8f98", GRID: "#33383f"}
@@ -62,9 +62,12 @@ def figure_uris(figure: Figure) -> tuple[str, str]:
 
 
 def color_bar() -> str:
-    """The colours of deviations from low to high, as a CSS gradient."""
-    colors = colormaps[DEVIATION_COLORMAP](np.linspace(0, 1, 17))
-    return f"linear-gradient(to right, {', '.join(map(to_hex, colors))})"
+    """The colours of deviations from low to high, as a CSS gradient; 3 % at each end are beyond."""
+    colors = map(to_hex, colormaps[DEVIATION_COLORMAP](np.linspace(0, 1, 17)))
+    places = np.linspace(3, 97, 17)
+    between = ", ".join(f"{color} {place:g}%" for color, place in zip(colors, places, strict=True))
+    ends = f"{FAR_BELOW} 3%, {between}, {FAR_ABOVE} 97%"
+    return f"linear-gradient(to right, {ends})"
 
 
 def _figure_uri(figure: Figure) -> str:

@@ -10,7 +10,15 @@ from typing import Any
 import jinja2
 
 from vanejax.report.pictures import color_bar
-from vanejax.report.wording import degrees, direction, fixed, millimetres, percent, significant
+from vanejax.report.wording import (
+    degrees,
+    direction,
+    fixed,
+    millimetres,
+    percent,
+    plus_minus,
+    significant,
+)
 
 
 def page(name: str, **values: Any) -> str:
@@ -22,7 +30,7 @@ def page(name: str, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for words in (degrees, direction, fixed, millimetres, percent, significant):
+    for words in (degrees, direction, fixed, millimetres, percent, plus_minus, significant):
         environment.filters[words.__name__] = words
     script = source("viewer.js")
     return environment.get_template(name).render(

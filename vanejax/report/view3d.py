@@ -109,7 +109,13 @@ def pose_view(result: PoseResult, scan: MeasuredScan, part: Part) -> View3d:
     shown = viewer(result, scan, part)
     lost = np.isnan(result.verification.deviation_mm).any()
     legend = [("lost", "no partner on the part")] if lost else []
-    return _view(shown, shown.poses, legend, limit_mm=color_limit_mm(result.verification))
+    limit_mm = color_limit_mm(result.verification)
+    deviation = result.verification.deviation_mm
+    if (deviation < -limit_mm).any():
+        legend.append(("below", f"more than {limit_mm:g} mm below"))
+    if (deviation > limit_mm).any():
+        legend.append(("above", f"more than {limit_mm:g} mm outside"))
+    return _view(shown, shown.poses, legend, limit_mm=limit_mm)
 
 
 def _view(

@@ -13,14 +13,21 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 from scipy.spatial import cKDTree
 
 from vanejax.cad import Part
-from vanejax.localization import PoseResult
-from vanejax.plotting.canvas import DEVIATION_COLORMAP, NO_PARTNER, SCAN
-from vanejax.plotting.deviation import color_limit_mm, overlay_rotation
+from vanejax.localization import PoseResult, measurement_model
+from vanejax.localization.assessment import without_form_deviation
+from vanejax.localization.form_deviation import scaled_pose
+from vanejax.plotting.canvas import NO_PARTNER, SCAN
+from vanejax.plotting.deviation import (
+    color_limit_mm,
+    deviation_colormap,
+    form_terms,
+    overlay_rotation,
+)
+from vanejax.plotting.scene import Scene
 from vanejax.rigid import RigidTransform
 from vanejax.scans import MeasuredScan
 from vanejax.scans.voxels import Voxels
@@ -51,18 +58,26 @@ class Viewer(NamedTuple):
 def viewer(result: PoseResult, scan: MeasuredScan, part: Part) -> Viewer:
     """The part, the checked points and every pose of a result.
 
-    Points are the checked ones; the whole scan where none was checked.
+    Points are the checked ones; the whole scan where none was checked. They are without the stock
+    and the other size that were found: then they lie where their colours say.
     """
     verification = result.verification
     chosen, deviation = verification.checked, verification.deviation_mm
     if not len(chosen):
         chosen, deviation = np.arange(len(scan.points)), np.full(len(scan.points), np.nan)
-    points, codes_um = thinned(scan.points[chosen], _micrometres(deviation))
-    poses = {"Before": result.before, "After": result.part_from_camera}
+    form = result.refinement.form
+    points, pose = scan.points[chosen], result.part_from_camera
+    size = 1.0 if form is None else 1 + form.scale_error
+    if form_terms(form):
+        model = measurement_model(part, result.sensor_origin)
+        _, points, _ = without_form_deviation(model, points, pose, form)
+    points, codes_um = thinned(points, _micrometres(deviation))
+    poses = {"Before": result.before, "After": pose}
     poses |= {
         f"Alternative {number}": alternative.part_from_camera
         for number, alternative in enumerate(result.alternatives, 1)
     }
+    poses = {name: scaled_pose(pose, part.center, 1 / size) for name, pose in poses.items()}
     limit_mm = color_limit_mm(verification)
     return scene(
         part,
@@ -70,13 +85,18 @@ def viewer(result: PoseResult, scan: MeasuredScan, part: Part) -> Viewer:
         codes_um,
         poses,
         measured=("After",),
-        colors=colormaps[DEVIATION_COLORMAP](np.linspace(0, 1, 256)),
+        colors=_colors(),
         limit_mm=limit_mm,
-        reader_from_part=overlay_rotation(scan, part, result.part_from_camera),
+        reader_from_part=overlay_rotation(scan, Scene(part), result.part_from_camera),
         spacing_mm=spacing_mm(points),
         # little enough to hide behind the thinnest wall
         lift_mm=min(limit_mm, 0.005 * part.radius),
     )
+
+
+def _colors() -> np.ndarray:
+    """[256, 4], the colours of deviations; the first and the last are of those beyond."""
+    return deviation_colormap()(np.linspace(-1 / 254, 1 + 1 / 254, 256))
 
 
 def scene(

@@ -33,6 +33,18 @@ def millimetres(value: float, digits: int = 2) -> str:
     return f"{significant(value, digits)} mm" if math.isfinite(value) else significant(value)
 
 
+def plus_minus(value: float, sigma: float) -> str:
+    """A figure and its standard deviation, both as precise as that is known: 0.503 ± 0.003."""
+    if not (math.isfinite(value) and math.isfinite(sigma)):
+        return significant(value)
+    if sigma <= 0:
+        return significant(value, 3)
+    exponent = math.floor(math.log10(sigma))
+    # 0.0014 and 0.0006 are both more than 0.001 says
+    places = max(0, (sigma < 1.95 * 10**exponent) - exponent)
+    return f"{fixed(value, places)} ± {fixed(sigma, places)}"
+
+
 def percent(share: float) -> str:
     """A share of 1 as a percentage; a little is not nothing, and nearly all is not all."""
     if not math.isfinite(share):
