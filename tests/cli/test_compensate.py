@@ -126,7 +126,9 @@ def test_a_doubtful_pose_moves_nothing(files: Path, capsys, status: str, code: i
     assert err.count("\n") == 1
     assert not Path("moved.csv").exists()
     assert main([*command, "--accept-verdict", status]) == 0
-    assert f"note: the pose is {status}: made up" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert f"note: the pose is {status}: made up" in out
+    assert "note: what the verdict doubts is not in the uncertainty" in out
     assert Path("moved.csv").exists()
 
 

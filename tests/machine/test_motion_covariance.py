@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
 from vanejax.localization.pose_result import BOUND
+from vanejax.machine import motion_covariance
 from vanejax.machine.motion_covariance import MotionCovariance
 from vanejax.rigid import RigidTransform
 
@@ -68,6 +69,13 @@ def test_of_independent_errors_the_centre_of_the_first_is_kept() -> None:
     one, two = POSE.with_independent(other), other.with_independent(POSE)
     np.testing.assert_array_equal(one.center, CENTER)
     np.testing.assert_allclose(one.bounds_mm(points), two.bounds_mm(points), rtol=1e-9)
+
+
+def test_many_points_are_taken_in_blocks(monkeypatch) -> None:
+    points = np.random.default_rng(4).normal(0, 50, (10, 3))
+    expected = POSE.bounds_mm(points)
+    monkeypatch.setattr(motion_covariance, "BLOCK", 3)
+    np.testing.assert_array_equal(POSE.bounds_mm(points), expected)
 
 
 def test_what_is_beyond_any_machine_is_refused() -> None:

@@ -253,6 +253,9 @@ def _notes(record: PoseRecord, arguments: argparse.Namespace) -> list[str]:
         notes.append("the pose has no verdict: nobody checked it")
     elif record.verdict.status != "accepted":
         notes.append(f"the pose is {record.verdict.status}: {record.verdict.reason}")
+        notes.append(
+            "what the verdict doubts is not in the uncertainty: the pose may be off by more"
+        )
     if arguments.camera_pose is None:
         notes.append("the scan's frame is taken to be the machine's (no --camera-pose)")
     return [*notes, *cut_summary.notes(record)]

@@ -7,18 +7,23 @@ its errors.
 
 from vanejax.machine.calibration import Calibration, calibrate
 from vanejax.machine.controllers import Compensation
+from vanejax.machine.motion_covariance import MotionCovariance
 from vanejax.machine.pose_file import read_pose, write_result
+from vanejax.machine.pose_record import PoseRecord, read_record
 from vanejax.machine.positioning import MotionErrors, motion_errors
 from vanejax.machine.tool_path import ToolPath, compensate
 
 __all__ = [
     "Calibration",
     "Compensation",
+    "MotionCovariance",
     "MotionErrors",
+    "PoseRecord",
     "ToolPath",
     "calibrate",
     "compensate",
     "motion_errors",
     "read_pose",
+    "read_record",
     "write_result",
 ]

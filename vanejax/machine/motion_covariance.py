@@ -17,6 +17,7 @@ from vanejax.machine.positioning import recentred
 from vanejax.rigid import RigidTransform
 
 FARTHEST_MM = 1e7  # ten kilometres: no machine is larger
+BLOCK = 100_000  # points at once
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -68,11 +69,15 @@ class MotionCovariance:
         """
         _check_near(points)
         arms = np.asarray(points, np.float64) - self.center
+        blocks = np.array_split(arms, len(arms) // BLOCK + 1)
+        return BOUND * np.sqrt(np.concatenate([self._largest_variance(b) for b in blocks]))
+
+    def _largest_variance(self, arms: np.ndarray) -> np.ndarray:
         ways = np.zeros((len(arms), 3, 6))  # of a rotation vector w and a shift v: w x arm + v
         ways[:, :, :3] = np.cross(np.eye(3), arms[:, None, :]).swapaxes(1, 2)
         ways[:, :, 3:] = np.eye(3)
         variance = np.linalg.eigvalsh(ways @ self.covariance @ ways.swapaxes(1, 2))[:, -1]
-        return BOUND * np.sqrt(np.maximum(variance, 0))
+        return np.maximum(variance, 0)
 
 
 def _check_near(points: np.ndarray) -> None:
