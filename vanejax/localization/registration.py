@@ -13,6 +13,7 @@ import numpy as np
 
 from vanejax.cad.part import Part, load_part
 from vanejax.errors import InputError
+from vanejax.localization import misfit
 from vanejax.localization.assessment import (
     COMPARED_POINTS,
     Assessment,
@@ -32,7 +33,7 @@ from vanejax.localization.sensor_calibration import Calibration
 from vanejax.localization.verdict import Limits
 from vanejax.rigid import RigidTransform, rigid_from_matrix
 from vanejax.scanner.sensor import Sensor, preset
-from vanejax.scans import MeasuredScan, Segments, clean_scan, load_scan
+from vanejax.scans import MeasuredScan, clean_scan, load_scan
 
 if TYPE_CHECKING:
     from vanejax.training.weight_file import TrainedMatcher
@@ -121,11 +122,16 @@ def register(
     task = _Task(part, init, weights, limits or Limits(), form, sensor, seed, seconds)
     results = []
     for segments in segmentations(scan, part, segment, seed=seed):
-        result = _register_segment(scan, segments, task)
+        seen = scan if segments is None else without_clutter(scan, segments)
+        result = _register_from_sensor(seen, task)
+        if segments is not None:
+            model = measurement_model(part, scan.sensor_origin)
+            result = with_clutter(result, scan, segments, model, limits=task.limits, seed=seed)
+        results.append((result, seen))
         if task.is_sound(result):
-            return result
-        results.append(result)
-    return max(results, key=lambda r: (STATUSES.index(r.verdict.status), r.verification.support))
+            break
+    result, seen = max(results, key=lambda tried: task.rank(tried[0]))
+    return _name_other_shape(result, scan, seen, task)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -141,6 +147,10 @@ class _Task:
     seed: int
     seconds: dict[str, float]
 
+    def without_hints(self) -> _Task:
+        """The same, of a part of which no pose and no weights are known."""
+        return dataclasses.replace(self, init=None, weights=None)
+
     def is_sound(self, result: PoseResult) -> bool:
         """Whether a pose explains the scan so well that nothing else need be tried."""
         return (
@@ -148,14 +158,56 @@ class _Task:
             and result.verification.support >= self.limits.least_support
         )
 
+    def rank(self, result: PoseResult) -> tuple[bool, int, float]:
+        """The largest is the best result."""
+        status = STATUSES.index(result.verdict.status)
+        return self.is_sound(result), status, result.verification.support
 
-def _register_segment(scan: MeasuredScan, segments: Segments | None, task: _Task) -> PoseResult:
-    """The pose of the part in the scan, or in the segment of it that is taken for the part."""
-    if segments is None:
-        return _register_from_sensor(scan, task)
-    result = _register_from_sensor(without_clutter(scan, segments), task)
-    model = measurement_model(task.part, scan.sensor_origin)
-    return with_clutter(result, scan, segments, model, limits=task.limits, seed=task.seed)
+
+def _name_other_shape(
+    result: PoseResult, scan: MeasuredScan, seen: MeasuredScan, task: _Task
+) -> PoseResult:
+    """A result that is rejected where the scan fits another shape much better than the part.
+
+    Args:
+      result: of the part.
+      scan: the whole one.
+      seen: what of it the result is of.
+      task: what `register` was asked for.
+    """
+    if not misfit.fits_badly(result, task.limits):
+        return result
+    for factor, shown, candidates in _other_shapes(result, scan, seen, task):
+        scaled = misfit.times(shown, factor)
+        model = measurement_model(task.part, scaled.sensor_origin)
+        other = _localize(model, scaled, candidates, task.without_hints())
+        clear = misfit.is_clear(other.verification.support, result.verification.support)
+        if task.is_sound(other) and clear:
+            verdict = Verdict("rejected", misfit.in_words(factor, other, result))
+            return dataclasses.replace(result, verdict=verdict, alternatives=())
+    return result
+
+
+def _other_shapes(
+    result: PoseResult, scan: MeasuredScan, seen: MeasuredScan, task: _Task
+) -> Iterator[tuple[float, MeasuredScan, Candidates]]:
+    """Factors of a scan at which it fits clearly better than the part, and poses of that."""
+    with _timed(task.seconds, "other shapes"):
+        model = measurement_model(task.part, seen.sensor_origin)
+        own = misfit.support(model, result.part_from_camera, seen.points, seed=task.seed)
+        if task.init is not None:  # the part may well be far from the guess
+            elsewhere = search(model, seen.points, seed=task.seed).pose(0)
+            own = max(own, misfit.support(model, elsewhere, seen.points, seed=task.seed))
+        mirrored = misfit.mirror_image(model, seen, own, seed=task.seed)
+    if mirrored is not None:
+        yield misfit.MIRRORED, seen, mirrored
+    # what was taken for a table may be the rest of a part in another unit
+    for shown in (seen,) if seen is scan else (seen, scan):
+        with _timed(task.seconds, "other shapes"):
+            resized = misfit.other_size(model, shown, own, seed=task.seed)
+        if resized is not None:
+            factor, candidates = resized
+            yield factor, shown, candidates
 
 
 def _register_from_sensor(scan: MeasuredScan, task: _Task) -> PoseResult:
