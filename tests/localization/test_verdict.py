@@ -54,6 +54,9 @@ REJECTED = {
         "missing_share": 0.5
     },
     "the points lie 3 mm off the surface": {"tolerance_mm": 9.0},
+    "the scan is 7.0% larger than the CAD model: it is a part of another size": {
+        "form": FormDeviation(scale_error=0.07, scale_sigma=0.001)
+    },
 }
 
 

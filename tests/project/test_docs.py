@@ -24,6 +24,7 @@ import pytest
 import registration_contract
 import test_verdict
 from absl import flags
+from example_result import example_result
 from test_architecture import GROUND, WINGS
 
 from experiments.pages.reproduction.studies import STUDIES
@@ -33,8 +34,8 @@ from experiments.studies.comparison.settings import METHODS
 from vanejax.cli.program import main, make_parser
 from vanejax.cli.register import EXIT_CODES
 from vanejax.errors import InputError
-from vanejax.localization import clutter_removal
-from vanejax.localization.pose_result import FormDeviation
+from vanejax.localization import clutter_removal, misfit
+from vanejax.localization.pose_result import FormDeviation, Verdict
 from vanejax.localization.verdict import CompetingHypothesis
 
 ROOT = Path(__file__).parents[2]
@@ -400,6 +401,7 @@ def test_every_reason_of_the_verdict_has_its_line() -> None:
         CompetingHypothesis(-20.0, 180.0, 0.5, pose),
         CompetingHypothesis(1.0, 180.0, 0.5, pose),
     )
+    results = example_result(), example_result("rejected")
     verdicts = [
         test_verdict.verdict(),
         test_verdict.verdict(competing=(close,)),
@@ -411,6 +413,7 @@ def test_every_reason_of_the_verdict_has_its_line() -> None:
         test_verdict.verdict(uncertainty={"weakest_translation_sigma_mm": 2.0}),
         *(test_verdict.verdict(form=FormDeviation(**form)) for form in test_verdict.FORMS),
         *(test_verdict.verdict(**changes) for changes in test_verdict.REJECTED.values()),
+        *(Verdict("rejected", misfit.in_words(k, *results)) for k in (misfit.MIRRORED, 0.95, 10)),
     ]
     used = set()
     for verdict in verdicts:

@@ -27,7 +27,7 @@ from vanejax.localization.pose_search import (
 )
 from vanejax.localization.residuals import MeasurementModel, RayCasting, SurfaceMatching
 from vanejax.localization.scan_patches import view_of
-from vanejax.localization.verdict import Limits
+from vanejax.localization.verdict import Limits, size_in_words
 from vanejax.localization.verification import verify
 from vanejax.rigid import RigidTransform
 from vanejax.scans.measured_scan import MeasuredScan
@@ -42,9 +42,10 @@ FITTING, KEPT = 3, 6  # poses of each size, and of all sizes, that are looked at
 SIZE_STEPS = (0.04, 0.02, 0.01, 0.005, 0.0025)
 TOLERANCE, NEAR = 0.01, 0.05  # of the part's radius; the second while sizes are apart by a step
 SAME_SIZE = 0.03  # what is less is a term of the part's form
+ON_THE_PART = 0.9  # of the points: then no other shape is sought
 UNIT = 0.01  # a size this near to a unit's is that unit
 CLEARLY = 0.5  # of what a pose leaves open another shape leaves no more
-OWN_MIRROR_IMAGE = 0.9  # of the surface that lies on the mirror image
+OWN_MIRROR_IMAGE = 0.98  # of the surface that lies on the mirror image
 
 
 def times(scan: MeasuredScan, factor: float) -> MeasuredScan:
@@ -59,12 +60,17 @@ def times(scan: MeasuredScan, factor: float) -> MeasuredScan:
     )
 
 
-def fits_badly(result: PoseResult, limits: Limits) -> bool:
-    """Whether the scan leaves so much open that it may be of another shape."""
-    form = result.refinement.form
+def fits_badly(result: PoseResult, part: Part, limits: Limits) -> bool:
+    """Whether the scan leaves so much open that it may be of another shape than the part.
+
+    A crop that lies on the part does not.
+    """
+    if result.verdict.status != "ambiguous":
+        return result.verdict.status == "rejected"
+    checks, form = result.verification, result.refinement.form
     return (
-        result.verdict.status == "rejected"
-        or result.verification.support < limits.least_support
+        (checks.support < limits.least_support and checks.inlier_share < ON_THE_PART)
+        or checks.tolerance_mm / 3 > limits.doubtful_noise * part.radius
         or (form is not None and form.unexplained_share > limits.most_unexplained_share)
         or (form is not None and not form.converged)
     )
@@ -137,7 +143,10 @@ def in_words(factor: float, other: PoseResult, result: PoseResult) -> str:
     """
     checks = other.verification
     within = f"within {checks.tolerance_mm:.3g} mm"
-    itself = f"{result.verification.inlier_share:.0%} on the part itself"
+    itself = (
+        f"{result.verification.inlier_share:.0%} on the part itself (within "
+        f"{result.verification.tolerance_mm:.3g} mm)"
+    )
     if factor == MIRRORED:
         return (
             f"the scan fits the mirror image of the CAD model: {checks.inlier_share:.0%} of the "
@@ -149,17 +158,14 @@ def in_words(factor: float, other: PoseResult, result: PoseResult) -> str:
     figures = f"{checks.inlier_share:.0%} of the points lie on a part of that size ({within}), "
     for ratio in unit_ratios():
         if abs(size / ratio - 1) < UNIT:
-            larger, smaller = ("scan", "CAD model") if ratio > 1 else ("CAD model", "scan")
+            times = f"{ratio:.4g}" if ratio > 1 else f"1/{1 / ratio:.4g}"
             return (
-                f"the {larger} is {max(ratio, 1 / ratio):.4g} times as large as the {smaller}: "
-                f"{figures}{itself}: one of the two is in another unit (--units-scan, --units-cad)"
+                f"the scan is {times} times as large as the CAD model: {figures}{itself}: one of "
+                "the two is in another unit (--units-scan, --units-cad)"
             )
-    by = f"{abs(size - 1):.1%} {'larger' if size > 1 else 'smaller'} than"
-    if abs(np.log(size)) > np.log(1.5):
-        by = f"{size:.3g} times as large as"
     return (
-        f"the scan is {by} the CAD model: {figures}{itself}: it is a part of another size, or the "
-        "scale of the scan or of the CAD file is wrong"
+        f"{size_in_words(size - 1)}: {figures}{itself}: it is a part of another size, or the scale "
+        "of the scan or of the CAD file is wrong"
     )
 
 

@@ -175,14 +175,13 @@ def _name_other_shape(
       seen: what of it the result is of.
       task: what `register` was asked for.
     """
-    if not misfit.fits_badly(result, task.limits):
+    if not misfit.fits_badly(result, task.part, task.limits):
         return result
     for factor, shown, candidates in _other_shapes(result, scan, seen, task):
         scaled = misfit.times(shown, factor)
         model = measurement_model(task.part, scaled.sensor_origin)
         other = _localize(model, scaled, candidates, task.without_hints())
-        clear = misfit.is_clear(other.verification.support, result.verification.support)
-        if task.is_sound(other) and clear:
+        if task.rank(other) > task.rank(result):
             verdict = Verdict("rejected", misfit.in_words(factor, other, result))
             return dataclasses.replace(result, verdict=verdict, alternatives=())
     return result
@@ -334,8 +333,14 @@ def _refine(
 
 def _notes(assessment: Assessment) -> Iterator[str]:
     """What only the guess decided."""
-    for other in assessment.ruled_out:
-        yield f"a pose turned by {other.rotation_deg:.1f} deg fits as well; the guess rules it out"
+    turns = [f"{other.rotation_deg:.1f} deg" for other in assessment.ruled_out]
+    if len(turns) == 1:
+        yield f"a pose turned by {turns[0]} fits as well; the guess rules it out"
+    elif turns:
+        yield (
+            f"{len(turns)} other poses fit as well, one turned by {turns[0]}; the guess rules them "
+            "out"
+        )
 
 
 def _load_weights(

@@ -31,6 +31,7 @@ class Limits:
         each other pose that was tried.
       tolerance_deg, tolerance_mm: what the job needs: the 95 % bounds of the pose, in its
         weakest directions, are to be within.
+      most_scale_error: of a scan against the CAD model; above it the part is another one.
       most_field_mm: standard deviation of a smooth deviation of form; above it no pose is certain,
         since a deviation that large is seldom random: it is stock on one side, or a bend.
       most_beyond_edges_share: of the points, those that lie beyond the part's edges.
@@ -47,6 +48,7 @@ class Limits:
     least_preference: float = 4.0
     tolerance_deg: float = 0.5
     tolerance_mm: float = 1.0
+    most_scale_error: float = 0.035
     most_field_mm: float = 0.25
     most_beyond_edges_share: float = 0.003
     most_unexplained_share: float = 0.05
@@ -82,7 +84,7 @@ def judge(
     How the part differs from its CAD model is named in every verdict that is not a rejection.
     """
     limits = limits or Limits()
-    for reason in _faults(verification, radius_mm, limits):
+    for reason in _faults(verification, form, radius_mm, limits):
         return Verdict("rejected", reason)
     differences = "".join(f"; {words}" for words in in_words(form))
     for reasons in (
@@ -126,7 +128,9 @@ def in_words(form: FormDeviation | None) -> Iterator[str]:
         yield f"{what} by {form.field_mm:.2g} mm{length}"
 
 
-def _faults(verification: Verification, radius_mm: float, limits: Limits) -> Iterator[str]:
+def _faults(
+    verification: Verification, form: FormDeviation | None, radius_mm: float, limits: Limits
+) -> Iterator[str]:
     """What is wrong with a pose, the worst first."""
     inliers = round(verification.inlier_share * len(verification.checked))
     if inliers < limits.least_inliers:
@@ -152,6 +156,17 @@ def _faults(verification: Verification, radius_mm: float, limits: Limits) -> Ite
             f"the points lie {noise:.2g} mm off the surface: the part is not like its CAD model, "
             "or it is another part"
         )
+    if form is not None and abs(form.scale_error) > limits.most_scale_error:
+        yield (
+            f"{size_in_words(form.scale_error)}: it is a part of another size, or the scale of the "
+            "scan or of the CAD file is wrong"
+        )
+
+
+def size_in_words(scale_error: float) -> str:
+    """How much larger or smaller the scan is than the CAD model."""
+    word = "larger" if scale_error > 0 else "smaller"
+    return f"the scan is {abs(scale_error):.1%} {word} than the CAD model"
 
 
 def _doubts(
