@@ -73,12 +73,14 @@ def viewpoints_picture(sphere: Viewpoints, printed: Viewpoints, center: np.ndarr
     return figure
 
 
-def registered(scanner: Scanner, views: Viewpoints, seed: int) -> tuple[PoseResult, MeasuredScan]:
-    """One scan by the paper's camera, registered from no guess."""
+def registered(
+    scanner: Scanner, part: Part, views: Viewpoints, seed: int
+) -> tuple[PoseResult, MeasuredScan]:
+    """One scan of the scanner's part by the paper's camera, registered to a CAD model."""
     rng = np.random.default_rng(seed)
     measured = measure(scanner, preset("paper_camera"), views.view(VIEW), rng)
     scan = clean_scan(measured.points)
-    return register(scan, scanner.part, seed=seed), scan
+    return register(scan, part, seed=seed), scan
 
 
 def scene_picture(views: Viewpoints, seed: int) -> Figure:
@@ -118,8 +120,12 @@ def main(settings: argparse.Namespace) -> None:
     scanner = Scanner(part, surface_samples=SURFACE_SAMPLES)
     sphere = hemisphere_viewpoints(part.center)
     printed = hemisphere_viewpoints(part.center, formula="printed")
-    result, scan = registered(scanner, sphere, settings.seed)
-    cast = as_cast(part, InvestmentCasting(allowance_mm=0.5), np.random.default_rng(settings.seed))
+    result, scan = registered(scanner, part, sphere, settings.seed)
+    cast, flatter = (
+        as_cast(part, InvestmentCasting(waviness_mm=wave), np.random.default_rng(settings.seed))
+        for wave in (0.15, 0.1)
+    )
+    of_cast, cast_scan = registered(Scanner(flatter), part, sphere, settings.seed)
     figures = {
         "how_viewpoints": viewpoints_picture(sphere, printed, part.center),
         "how_shadow": shadow_picture(scanner, Camera(), sphere, SHOWN)[0],
@@ -129,6 +135,7 @@ def main(settings: argparse.Namespace) -> None:
             find_weights(settings.weights, part), part, sphere, settings.seed
         ),
         "how_deviation": plotting.deviation_map(result, scan, part),
+        "how_form": plotting.deviation_map(of_cast, cast_scan, part),
         "how_residuals": plotting.residual_histogram(result),
     }
     settings.out.mkdir(parents=True, exist_ok=True)

@@ -195,9 +195,9 @@ def overlay_before_after(result: PoseResult, scan: MeasuredScan, part: Part) -> 
 
 
 def color_limit_mm(verification: Verification, measured_mm: np.ndarray | None = None) -> float:
-    """Where the colours of deviations end: a round figure that no inlier is beyond.
+    """Where the colours of deviations end: a round figure that 99 % of the inliers are not beyond.
 
-    Where there is none, 98 % of all deviations are not beyond it.
+    Where there is no inlier, 98 % of all points.
 
     Args:
       verification: of n points.
@@ -208,7 +208,7 @@ def color_limit_mm(verification: Verification, measured_mm: np.ndarray | None = 
     inlier = finite & (verification.status == PointStatus.INLIER)
     if not inlier.any():
         return _round_limit_mm(verification.deviation_mm, 98)
-    limit = _round_limit_mm(verification.deviation_mm[inlier], 100)
+    limit = _round_limit_mm(verification.deviation_mm[inlier], 99)
     return limit if measured_mm is None else max(limit, _round_limit_mm(measured_mm[inlier], 98))
 
 
