@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from example_result import example_result, pose
 
-from vanejax.localization.pose_result import BOUND, FormDeviation, Verdict
+from vanejax.localization.pose_result import BOUND, FormDeviation, MaterialRegion, Verdict
 from vanejax.localization.verdict import CompetingHypothesis, Limits, judge
 
 RADIUS = 70.0
@@ -96,7 +96,7 @@ def test_few_inliers_are_counted_not_shared():
     assert verdict(checked=np.arange(43), inlier_share=40 / 43).status == "accepted"
     found = verdict(checked=np.arange(43), inlier_share=39 / 43)
     assert found.status == "rejected"
-    assert found.reason == "only 39 points lie on the part"
+    assert found.reason.startswith("only 39 points lie on the part")
 
 
 def test_the_worst_fault_comes_first():
@@ -227,3 +227,33 @@ def test_limits_are_respected(limits, case):
     """Each turns the verdict that the defaults give."""
     before, after = verdict(**case), verdict(**case, limits=limits)
     assert (before.status == "accepted") != (after.status == "accepted")
+
+
+def test_points_off_the_part_outweigh_other_poses():
+    """Another part is seldom in one pose; of a crop the other poses are what counts."""
+    assert verdict(inlier_share=0.65, competing=[other(0.0)]).reason.startswith("only 65%")
+    crop = verdict(inlier_share=0.97, unmeasured_share=0.4, competing=[other(0.0)])
+    assert "another pose" in crop.reason
+    crop = verdict(inlier_share=0.97, unmeasured_share=0.4)
+    assert crop.reason.startswith("97% of the points lie on the part, and 40% of the surface")
+
+
+REGION = MaterialRegion(True, 0.052, 364.0, np.array([12.4, -9.0, 11.0]), 14.2)
+PLACE = "5.2% of the scan (some 360 mm^2 about (12, -9, 11) mm in the part's frame)"
+
+
+@pytest.mark.parametrize(
+    ("is_missing", "words"),
+    [
+        (True, f"{PLACE} was seen up to 14 mm deep through material of the CAD model"),
+        (False, f"{PLACE} lies up to 14 mm outside the CAD model"),
+    ],
+)
+def test_missing_and_extra_material_is_named_with_place_and_size(is_missing, words):
+    regions = (dataclasses.replace(REGION, is_missing=is_missing),)
+    accepted = verdict(regions=regions)
+    assert accepted.status == "accepted"
+    assert words in accepted.reason
+    assert words in verdict(regions=regions, violation_share=0.3).reason  # rejected
+    nowhere = verdict(regions=regions, inlier_share=0.4)  # no place is right at a wrong pose
+    assert words not in nowhere.reason

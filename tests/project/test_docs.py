@@ -407,6 +407,7 @@ def test_every_reason_of_the_verdict_has_its_line() -> None:
         test_verdict.verdict(competing=(close,)),
         test_verdict.verdict(competing=(better, close)),
         test_verdict.verdict(inlier_share=0.65),
+        test_verdict.verdict(inlier_share=0.95, unmeasured_share=0.4),
         test_verdict.verdict(inlier_share=0.65, unmeasured_share=float("nan")),
         test_verdict.verdict(tolerance_mm=3 * 0.03 * test_verdict.RADIUS),
         test_verdict.verdict(uncertainty={"weakest_rotation_sigma_deg": 2.0}),

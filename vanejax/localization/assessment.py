@@ -13,6 +13,7 @@ import numpy as np
 from vanejax.localization.covariance import uncertainty
 from vanejax.localization.fine_registration import robust_gauss_newton, subset
 from vanejax.localization.form_deviation import as_designed, scaled_pose
+from vanejax.localization.material import material_regions
 from vanejax.localization.pose_batch import concatenate, distances, distinct, is_same, select, stack
 from vanejax.localization.pose_result import (
     Alternative,
@@ -216,7 +217,11 @@ def _verify(
     if form is not None and not form.is_as_designed:
         tolerance_mm = float(inlier_tolerance_mm(model, stack(pose), points[checked])[0])
     view = view_of(model, points[checked])
-    return verify(model, pose, points, checked, tolerance_mm=tolerance_mm, view=view)
+    found = verify(model, pose, points, checked, tolerance_mm=tolerance_mm, view=view)
+    regions = material_regions(
+        model, pose, points[checked], found.status, tolerance_mm=tolerance_mm
+    )
+    return dataclasses.replace(found, regions=regions)
 
 
 def without_form_deviation(

@@ -147,6 +147,26 @@ class Refinement:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class MaterialRegion:
+    """A region in which a scan is not as the CAD model, see `vanejax.localization.material`.
+
+    Attributes:
+      is_missing: whether the CAD model has material there that the scan was seen through; else the
+        scan has points there outside of the CAD model.
+      share: of the scan's points, 0 to 1, those of the region.
+      area_mm2: of the surface that was measured there, about.
+      center: [3] mm, part frame, its middle.
+      depth_mm: how deep it is, or how far outside: all but the outermost 5 % of its points.
+    """
+
+    is_missing: bool
+    share: float
+    area_mm2: float
+    center: np.ndarray
+    depth_mm: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Verification:
     """What the scan says about a pose.
 
@@ -163,6 +183,7 @@ class Verification:
       deviation_mm: [n], signed distance to the CAD surface along its normal, positive outside the
         material; NaN where a point has no partner on the part.
       score: one figure to compare poses of the same scan, larger is better.
+      regions: in which material is missing or extra, the largest ones.
     """
 
     inlier_share: float
@@ -174,6 +195,7 @@ class Verification:
     status: np.ndarray
     deviation_mm: np.ndarray
     score: float
+    regions: tuple[MaterialRegion, ...] = ()
 
     @property
     def support(self) -> float:

@@ -6,8 +6,16 @@ import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 
-from vanejax.localization.pose_result import FormDeviation, Uncertainty, Verdict, Verification
+from vanejax.localization.pose_result import (
+    FormDeviation,
+    MaterialRegion,
+    Uncertainty,
+    Verdict,
+    Verification,
+)
 from vanejax.rigid import RigidTransform
+
+MOST_OF_THEM = 0.9  # of the points: so many are not few
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,12 +89,15 @@ def judge(
 ) -> Verdict:
     """The verdict on a refined pose; the first reason that holds is given.
 
-    How the part differs from its CAD model is named in every verdict that is not a rejection.
+    How the part differs from its CAD model is named in every verdict that is not a rejection, and
+    where material is missing or extra also in that of a pose that most of the points lie on.
     """
     limits = limits or Limits()
+    material = "".join(f"; {_in_words(region)}" for region in verification.regions)
     for reason in _faults(verification, form, radius_mm, limits):
-        return Verdict("rejected", reason)
-    differences = "".join(f"; {words}" for words in in_words(form))
+        most = verification.inlier_share >= limits.least_inlier_share
+        return Verdict("rejected", reason + (material if most else ""))
+    differences = "".join(f"; {words}" for words in in_words(form)) + material
     for reasons in (
         _doubts(verification, competing, radius_mm, limits),
         _doubts_of_form(form, limits),
@@ -128,27 +139,48 @@ def in_words(form: FormDeviation | None) -> Iterator[str]:
         yield f"{what} by {form.field_mm:.2g} mm{length}"
 
 
+def _in_words(region: MaterialRegion) -> str:
+    """Where material is missing or extra, and how much."""
+    x, y, z = region.center
+    area = f"{float(f'{region.area_mm2:.2g}'):,.0f}"  # two figures are certain at most
+    where = f"{region.share:.1%} of the scan (some {area} mm^2 about "
+    where += f"({x:.0f}, {y:.0f}, {z:.0f}) mm in the part's frame)"
+    if region.is_missing:
+        return (
+            f"{where} was seen up to {region.depth_mm:.2g} mm deep through material of the CAD "
+            "model: that is missing, or it is another part"
+        )
+    return (
+        f"{where} lies up to {region.depth_mm:.2g} mm outside the CAD model: extra material, "
+        "something that touches the part, or another part"
+    )
+
+
 def _faults(
     verification: Verification, form: FormDeviation | None, radius_mm: float, limits: Limits
 ) -> Iterator[str]:
     """What is wrong with a pose, the worst first."""
     inliers = round(verification.inlier_share * len(verification.checked))
     if inliers < limits.least_inliers:
-        yield f"only {inliers} points lie on the part"
+        yield (
+            f"only {inliers} points lie on the part: another part, a wrong unit, or next to "
+            "nothing of it in the scan"
+        )
     if verification.inlier_share < limits.least_inlier_share:
         yield (
-            f"only {verification.inlier_share:.0%} of the points lie on the part "
-            f"(within {verification.tolerance_mm:.3g} mm)"
+            f"only {verification.inlier_share:.0%} of the points lie on the part (within "
+            f"{verification.tolerance_mm:.3g} mm): another part, or too much else in the scan"
         )
     if verification.violation_share > limits.most_violation_share:
         yield (
             f"{verification.violation_share:.0%} of the points would have been seen through "
-            "the part's material"
+            "the part's material: another part, missing material, or a wrong place of the "
+            "sensor"
         )
     if verification.missing_share > limits.most_missing_share:
         yield (
             f"{verification.missing_share:.0%} of the surface that the sensor should have seen "
-            "between the measured points was not measured"
+            "between the measured points was not measured: another part, or shine and shadow"
         )
     noise = verification.tolerance_mm / 3
     if noise > limits.most_noise * radius_mm:
@@ -176,6 +208,9 @@ def _doubts(
     limits: Limits,
 ) -> Iterator[str]:
     """Why a pose without fault may still be another one, the gravest first."""
+    off_the_part = verification.inlier_share < limits.least_support
+    if off_the_part:
+        yield _weak_support(verification)
     near = [other for other in competing if other.preference < limits.least_preference]
     if near:
         best = min(near, key=lambda other: other.preference)
@@ -187,23 +222,29 @@ def _doubts(
             f"{best.translation_mm:.2f} mm; a view that shows where they differ, or a rough pose, "
             "decides"
         )
-    if verification.support < limits.least_support:
-        unmeasured = ""
-        if not math.isnan(verification.unmeasured_share):
-            unmeasured = (
-                f", and {verification.unmeasured_share:.0%} of the surface that the sensor "
-                "should have seen was not measured"
-            )
-        yield (
-            f"only {verification.inlier_share:.0%} of the points lie on the part{unmeasured}: "
-            "crop the scan to the part, and see that it is this part"
-        )
+    if verification.support < limits.least_support and not off_the_part:
+        yield _weak_support(verification)
     noise = verification.tolerance_mm / 3
     if noise > limits.doubtful_noise * radius_mm:
         yield (
             f"the points lie {noise:.2g} mm off the surface, {noise / radius_mm:.1%} of the part's "
             "radius: the pose is the best one, but may be off by more than its uncertainty says"
         )
+
+
+def _weak_support(verification: Verification) -> str:
+    """Points and surface that do not agree."""
+    unmeasured = ""
+    if not math.isnan(verification.unmeasured_share):
+        unmeasured = (
+            f", and {verification.unmeasured_share:.0%} of the surface that the sensor should have "
+            "seen was not measured"
+        )
+    only = "only " if verification.inlier_share < MOST_OF_THEM else ""
+    return (
+        f"{only}{verification.inlier_share:.0%} of the points lie on the part{unmeasured}: crop "
+        "the scan to the part, see that all of it is in the scan, and that it is not another part"
+    )
 
 
 def _doubts_of_form(form: FormDeviation | None, limits: Limits) -> Iterator[str]:
