@@ -76,12 +76,14 @@ class Kind:
       sensor: "white" noise, "quiet", "bend" (a smooth error), "scale" (a wrong one), "crop" (quiet,
         cut along the ring), or the paper's camera.
       other_part: whether the scan is of another part.
+      per_view: how many cases there are for each of the other kinds' views.
     """
 
     title: str
     cast: Cast = lambda part, to_camera, rng: Casting(part)
     sensor: str = "quiet"
     other_part: bool = False
+    per_view: int = 1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -221,6 +223,6 @@ KINDS = {
     "broken": Kind("corner missing", _broken),
     "paper_stock": Kind("uniform stock, paper's camera", _with_stock, PAPER_CAMERA),
     "paper_varying": Kind("varying stock, paper's camera", _varying, PAPER_CAMERA),
-    "crop": Kind("vanes cropped along the ring", sensor="crop"),
+    "crop": Kind("vanes cropped along the ring", sensor="crop", per_view=10),
     "other_part": Kind("another part", other_part=True),
 }

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.stats import chi2
 
 from experiments.runner.markdown import table as markdown_table
 from experiments.runner.required_accuracy import NEED_DEG, NEED_MM, within_need
@@ -27,19 +28,43 @@ from vanejax.plotting.canvas import (
 
 Report = Mapping[str, Any]
 FOUND_DEG = 5.0  # the pitch of the vanes is 7: what is farther off is another pose
+LISTED_DEG, LISTED_MM = 1.5, 1.5  # of a right pose; competing poses are not refined
 MOST_SIGMAS = 3.0
+# of the squared error over the covariance: as rare as `MOST_SIGMAS` of one Gaussian number
+RARE = 0.0027
+MOST_SQUARED = float(chi2.ppf(1 - RARE, 6))
 STAGES = {"before": "fine registration alone, from the truth", "after": "register"}
 FIGURES = ("rotation_deg", "translation_mm", "squared", "covered")
+WITHIN = ("rotation_within_bound", "translation_within_bound")
 
 
 def is_wrong(row: Report) -> bool:
-    """Whether an accepted pose would be wrong: off by more than the need, or than it says."""
+    """Whether an accepted pose would be wrong: off by more than the need, or than it says.
+
+    ``squared`` of a row is over 6, and None where it is not finite.
+    """
     after = row["after"]
-    if after is None:
+    if after is None or after["squared"] is None:
         return True
-    over = max(after["rotation_over_bound"], after["translation_over_bound"])
     needed = within_need(after["rotation_deg"], after["translation_mm"])
-    return bool(not needed or over * BOUND > MOST_SIGMAS)
+    return bool(not needed or 6 * after["squared"] > MOST_SQUARED)
+
+
+def is_beyond(row: Report) -> bool:
+    """Whether a magnitude exceeds `MOST_SIGMAS` standard deviations in the weakest direction."""
+    return BOUND * max(_over_bounds(row)) > MOST_SIGMAS
+
+
+def _over_bounds(row: Report) -> tuple[float, float]:
+    """Rotation and translation over their bounds."""
+    return row["after"]["rotation_over_bound"], row["after"]["translation_over_bound"]
+
+
+def _is_first(row: Report) -> bool:
+    """Whether the result is the right pose, by the measure of the competing ones."""
+    after = row["after"]
+    near = after and after["rotation_deg"] < LISTED_DEG and after["translation_mm"] < LISTED_MM
+    return bool(near)
 
 
 def summarize(rows: Sequence[Report]) -> dict[str, Any]:
@@ -60,11 +85,18 @@ def _summary(rows: Sequence[Report]) -> dict[str, Any]:
     """Counts, and figures of the scans in which the pose was found."""
     found = [r for r in rows if r["after"] and r["after"]["rotation_deg"] < FOUND_DEG]
     accepted = [row for row in rows if row["verdict"] == "accepted"]
+    placed = [row for row in accepted if row["after"]]  # the part is in the scan
+    ratios = [r["after"].get("times_cramer_rao") for r in found]
+    ratios = [ratio for ratio in ratios if ratio is not None]
+    cpu_seconds = [row["cpu_seconds"] for row in rows if "cpu_seconds" in row]
     return {
         "cases": len(rows),
         **{status: sum(row["verdict"] == status for row in rows) for status in STATUSES},
         "accepted_wrong": sum(map(is_wrong, accepted)),
+        "accepted_pitch_off": sum(row.get("pitch_off", False) for row in accepted),
+        "accepted_beyond": sum(map(is_beyond, placed)),
         "found": len(found),
+        "first": sum(map(_is_first, rows)),
         "listed": sum(row["listed"] for row in rows),
         **{
             stage: {
@@ -74,72 +106,140 @@ def _summary(rows: Sequence[Report]) -> dict[str, Any]:
             }
             for stage in STAGES
         },
-        "covered_accepted": _of(np.mean, [r["after"]["covered"] for r in accepted if r["after"]]),
+        "covered_accepted": _of(np.mean, [row["after"]["covered"] for row in placed]),
+        "within_bounds_accepted": [
+            _of(np.mean, [_over_bounds(row)[which] <= 1 for row in placed]) for which in (0, 1)
+        ],
+        "by_chance_accepted": _by_chance([row["after"].get("by_chance") for row in placed]),
+        "times_cramer_rao": {"median": _of(np.median, ratios), "rms": _of(_rms, ratios)},
         "seconds": _of(np.median, [row["seconds"] for row in rows]),
+        "cpu_seconds": _of(np.median, cpu_seconds),
     }
 
 
-def _of(statistic: Any, values: Sequence[float]) -> float:
-    return float(statistic(values)) if values else float("nan")
+def _by_chance(chances: Sequence[Report | None]) -> dict[str, float]:
+    """Of Gaussian errors: how many exceed `MOST_SIGMAS`, and how often the bounds hold.
+
+    NaN where a record does not say it of every pose.
+    """
+    if not chances or None in chances:
+        return dict.fromkeys(("beyond", *WITHIN), float("nan"))
+    means = {name: _of(np.mean, [each[name] for each in chances]) for name in WITHIN}
+    return {"beyond": float(sum(each["beyond"] for each in chances)), **means}
 
 
-def _lines(report: Report) -> Iterable[list[str]]:
+def _rms(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _of(statistic: Any, values: Sequence[float | None]) -> float:
+    """Of the values that are finite; NaN where none is."""
+    finite = [value for value in values if value is not None and np.isfinite(value)]
+    return float(statistic(finite)) if finite else float("nan")
+
+
+def _lines(summaries: Report) -> Iterable[list[str]]:
     """Cells of the table: a row for each kind, then all."""
-    kinds = {KINDS[kind].title: summary for kind, summary in report["kinds"].items()}
-    for title, summary in {**kinds, "all": report["all"]}.items():
+    kinds = {KINDS[kind].title: summary for kind, summary in summaries["kinds"].items()}
+    for title, summary in {**kinds, "all": summaries["all"]}.items():
         before, after = summary["before"], summary["after"]
+        chance = _digits("{:.2g}", summary["by_chance_accepted"]["beyond"])
         yield [
             title,
-            *(str(summary[name]) for name in ("cases", *STATUSES, "accepted_wrong", "listed")),
-            _digits(after["covered"]["mean"], "{:.0%}"),
-            _digits(summary["covered_accepted"], "{:.0%}"),
-            *(_digits(after["squared"][name], "{:.3g}") for name in ("median", "mean")),
+            *(str(summary[name]) for name in ("cases", *STATUSES, "accepted_wrong")),
+            f"{summary['accepted_beyond']}{chance and f' ({chance})'}",
+            f"{summary['first']}, {summary['listed']}",
+            _digits("{:.0%}", after["covered"]["mean"], summary["covered_accepted"]),
+            _digits("{:.0%}", *summary["within_bounds_accepted"]),
+            _digits("{:.3g}", *(after["squared"][name] for name in ("median", "mean"))),
             *(
-                _digits(stage[name]["median"], "{:.2g}")
+                _digits("{:.2g}", *(stage[name]["median"] for name in FIGURES[:2]))
                 for stage in (before, after)
-                for name in ("rotation_deg", "translation_mm")
             ),
-            _digits(summary["seconds"], "{:.1f}"),
+            _digits("{:.1f}", summary["cpu_seconds"]),
         ]
 
 
-def _digits(value: float | None, form: str) -> str:
-    return "" if value is None else form.format(value)
+def _digits(form: str, *values: float) -> str:
+    """The values that there are, with commas between them."""
+    return ", ".join(form.format(value) for value in values if np.isfinite(value))
+
+
+HEAD = (
+    "kind", "cases", *STATUSES, "accepted and wrong", "beyond 3 sigma (by chance)",
+    "right pose first, given", "axis bounds hold: all, accepted",
+    "magnitude bounds hold: deg, mm", "squared error: median, mean", "before: deg, mm",
+    "after: deg, mm", "CPU s",
+)  # fmt: skip
 
 
 def table(report: Report) -> str:
-    """A row for each kind in Markdown, and every wrong pose that was accepted."""
-    head = (
-        "kind", "cases", *STATUSES, "accepted and wrong", "right pose given", "95 % bounds hold",
-        "of accepted", "squared error: median", "mean", "before: deg", "mm", "after: deg", "mm",
-        "s",
-    )  # fmt: skip
-    lines = [
-        markdown_table(head, _lines(report)),
-        "",
-        f"Wrong: off by more than {NEED_DEG:g} deg or {NEED_MM:g} mm, or than {MOST_SIGMAS:g} "
-        "standard deviations in the weakest direction. Right pose given: as the result, or among "
-        "the competing poses. Bounds: the share of the six axes of all poses found (within "
-        f"{FOUND_DEG:g} deg). Squared error: over the covariance, 1 on average where the "
-        "covariance is true. Before: fine registration alone, from nearly the true pose; after: "
-        "`register`; medians.",
-    ]
-    if report["accepted_wrong"]:
-        lines.append("")
-    for row in report["accepted_wrong"]:
-        after = row["after"]
-        off = "another part"
-        if after is not None:
-            over = BOUND * max(after["rotation_over_bound"], after["translation_over_bound"])
-            off = (
-                f"{after['rotation_deg']:.2g} deg and {after['translation_mm']:.2g} mm off, "
-                f"{over:.1f} standard deviations"
-            )
-        lines.append(
-            f"- accepted and wrong: {row['part']}, {KINDS[row['kind']].title}, number "
-            f"{row['number']}: {off}; “{row['reason']}”"
-        )
+    """A row for each kind in Markdown, what it says of all, and every wrong pose accepted.
+
+    Everything is made from the rows of the report.
+    """
+    summaries = summarize(report["rows"])
+    lines = [markdown_table(HEAD, _lines(summaries)), "", LEGEND]
+    if remarks := list(_remarks(summaries)):
+        lines += ["", *remarks]
     return "\n".join(lines)
+
+
+LEGEND = (
+    f"Wrong: off by more than {NEED_DEG:g} deg or {NEED_MM:g} mm, or by a squared error over the "
+    f"covariance of all six axes that {RARE:.2%} of Gaussian errors exceed. Beyond 3 sigma: "
+    "accepted, and rotation or translation is larger than three times its standard deviation in "
+    "the weakest direction; in brackets, how many Gaussian errors with these covariances would "
+    "be. Right pose given: as the result, or among the competing poses. Bounds: of 95 %; the "
+    f"share of the six axes of all poses found (within {FOUND_DEG:g} deg) and of those accepted, "
+    "and the share of the bounds of rotation and translation that are printed, of those accepted. "
+    "Squared error: over the covariance, 1 on average where the covariance is true. Before: fine "
+    "registration alone, from nearly the true pose; after: `register`; medians. CPU: median time "
+    "of `register`, all threads together."
+)
+
+
+def _remarks(summaries: Report) -> Iterable[str]:
+    """Lines of a list below the table."""
+    kinds = summaries["kinds"]
+    chance = summaries["all"]["by_chance_accepted"]
+    held, expected = summaries["all"]["within_bounds_accepted"], [chance[name] for name in WITHIN]
+    if np.isfinite([*held, *expected]).all():
+        yield (
+            f"- bounds of rotation and translation hold for {held[0]:.1%} and {held[1]:.1%} of "
+            f"the accepted poses; Gaussian errors with their covariances: {expected[0]:.1%} and "
+            f"{expected[1]:.1%}"
+        )
+    if "equal" in kinds and np.isfinite(kinds["equal"]["times_cramer_rao"]["rms"]):
+        ratio = kinds["equal"]["times_cramer_rao"]
+        yield (
+            f"- {KINDS['equal'].title}: the error is {ratio['rms']:.2f} times the Cramér-Rao bound "
+            f"(root mean square of {kinds['equal']['found']}; median {ratio['median']:.2f})"
+        )
+    if "crop" in kinds:
+        crops = kinds["crop"]
+        yield (
+            f"- {KINDS['crop'].title}: of {crops['cases']}, {crops['accepted']} are accepted, "
+            f"{crops['accepted_pitch_off']} of these a pitch off; the right pose is first in "
+            f"{crops['first']}, first or among the competing ones in {crops['listed']}"
+        )
+    yield from map(_accepted_wrong, summaries["accepted_wrong"])
+
+
+def _accepted_wrong(row: Report) -> str:
+    after, off = row["after"], "another part"
+    if after is not None:
+        squared = "not finite" if after["squared"] is None else f"{6 * after['squared']:.3g}"
+        off = (
+            f"{after['rotation_deg']:.2g} deg and {after['translation_mm']:.2g} mm off, squared "
+            f"error of all six axes {squared} ({MOST_SQUARED:.3g} is the most)"
+        )
+        if row.get("pitch_off"):
+            off += ", a pitch off"
+    return (
+        f"- accepted and wrong: {row['part']}, {KINDS[row['kind']].title}, number "
+        f"{row['number']}: {off}; “{row['reason']}”"
+    )
 
 
 def picture(report: Report) -> Figure:
