@@ -261,6 +261,7 @@ def main(settings: argparse.Namespace) -> dict[str, Any]:
             raise InputError(f"no {what} {', '.join(unknown)}; there are {', '.join(known)}")
     names = case_names(settings.views, settings.parts, settings.kinds)
     head = study.header("register, no guess, no training", settings)
+    del head["config"]["jobs"]  # no result depends on it
     kept = kept_rows(settings.out / "castings.json", head)
     rows = {name: kept[name] for name in names if name in kept}
 
