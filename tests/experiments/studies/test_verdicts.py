@@ -84,11 +84,11 @@ def test_wrong_poses_are_wrong(scan: PosedScan) -> None:
 
 def test_a_pitch_is_the_distance_of_the_vanes(scan: PosedScan) -> None:
     starts = wrong_poses(scan, np.random.default_rng(0))
-    for pose in [pose for kind, pose in starts if kind == "one pitch off"]:
-        turn, _ = scan.error(pose)
+    errors = [scan.error(pose) for kind, pose in starts if kind == "one pitch off"]
+    assert errors
+    for turn, shift in errors:
         assert turn == pytest.approx(360 / 54, abs=1e-6)
         # the part's centre is at mid-span: 300 mm from the engine's axis, within the rails' height
-        _, shift = scan.error(pose)
         assert shift == pytest.approx(300 * np.radians(360 / 54), rel=0.05)
 
 
