@@ -2,14 +2,13 @@
 
 python -m experiments.reproduce --quick [--weights FILE] [--out runs/reproduce]
 python -m experiments.reproduce [--real-scans FOLDER] [--shapes PATH] [--only NAME,...] [--plan]
-python -m experiments.reproduce --docs
 
 ``--quick`` shows the recorded results of experiments/results, evaluates the pretrained weights on
 the 54 test views and runs the virtual stand again: minutes. Without it everything is trained and
 measured again, each study in its own folder under ``--out``: many hours, ``--plan`` says how many.
 Give the same command again to go on: finished studies are kept. A study that fails is named in the
-page, the others go on, and the exit code is 1. ``--docs`` writes docs/results.md from the recorded
-results. Results: reproduction.html in ``--out``, which needs no network and no other file.
+page, the others go on, and the exit code is 1. Results: reproduction.html in ``--out``, which needs
+no network and no other file.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from experiments.pages.reproduction.document import Document, document, to_markdown
+from experiments.pages.reproduction.document import Document, document
 from experiments.pages.reproduction.live import evaluate_live, measure_position
 from experiments.pages.reproduction.page import to_page
 from experiments.pages.reproduction.run import estimate, make_folders, measured, run_studies
@@ -31,25 +30,8 @@ from vanejax.errors import InputError
 from vanejax.files import check_writable, write_json, write_text
 from vanejax.training.weight_file import PRETRAINED, find_weights
 
-DOCS = ROOT / "docs"
-PAGE = DOCS / "results.md"
 FILE = "reproduction.html"
 SOLIDS = "solids"  # what public.py itself trains on where there is no ModelNet40
-
-
-def docs_page() -> str:
-    """docs/results.md as the recorded results make it."""
-    mode = (
-        "Made by `python -m experiments.reproduce --docs` from the recorded results in "
-        "`experiments/results`; `--quick` makes an HTML page of it, with more pictures and the "
-        "pretrained weights evaluated again."
-    )
-    return to_markdown(document(recorded(), mode))
-
-
-def write_docs() -> None:
-    """Writes docs/results.md."""
-    write_text(PAGE, docs_page())
 
 
 def quick(out: Path, weights: str) -> None:
@@ -65,7 +47,7 @@ def quick(out: Path, weights: str) -> None:
         "Results are the recorded ones of experiments/results. For this page the weights were "
         "evaluated and the virtual stand was run again."
     )
-    _write(page, document(results, mode, live=live, docs=DOCS, run=out))
+    _write(page, document(results, mode, live=live, docs=ROOT / "docs", run=out))
 
 
 def full(out: Path, inputs: dict[str, str], only: str | None) -> list[Outcome]:
@@ -97,10 +79,6 @@ def _write(page: Path, report: Document) -> None:
 
 def main(settings: argparse.Namespace) -> int:
     """The command; its exit code."""
-    if settings.docs:
-        write_docs()
-        print(PAGE)
-        return 0
     if settings.quick:
         for name in ("real_scans", "shapes", "only"):
             if getattr(settings, name):
@@ -138,7 +116,6 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--only", metavar="NAMES", help="these studies and what they need")
     parser.add_argument("--plan", action="store_true", help="print the studies and end")
-    parser.add_argument("--docs", action="store_true", help="write docs/results.md and end")
     return parser
 
 

@@ -101,7 +101,7 @@ def page(path: Path, results: Mapping[str, Report]) -> str:
     return with_blocks(path.read_text(), lambda name: block(name, results))
 
 
-def write_pages(results: Mapping[str, Report], paths: Iterable[Path] | None = None) -> None:
-    """Rewrites the blocks of some pages, of all by default."""
-    for path in pages() if paths is None else paths:
+def write_pages(results: Mapping[str, Report]) -> None:
+    """Rewrites the blocks of all pages."""
+    for path in pages():
         write_text(path, page(path, results))

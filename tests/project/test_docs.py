@@ -212,7 +212,7 @@ def test_every_command_is_one_that_its_program_takes(page, folder) -> None:
         "python -m experiments.compare --config table1.py --methods icq",
         "python -m experiments.ablate --config vane.py --sweep model.neighbors=8,16",
         "python -m experiments.fine --vews 3",
-        "python -m experiments.results_page --fast",
+        "python -m experiments.docs --fast",
         "python -m experiments.studies.comparison.methods",
         "pip install -e '.[peer]'",
         "rm -rf runs",

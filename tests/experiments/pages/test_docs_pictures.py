@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import io
 from pathlib import Path
 
@@ -12,22 +11,13 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image, ImageChops
 
-from experiments import docs_pictures
-from experiments.pages.reproduction.document import Picture, document
-from experiments.pages.reproduction.studies import recorded
+from experiments import docs
 from vanejax.plotting.canvas import WIDTH_IN
 
-DOCS = Path(__file__).parents[3] / "docs"
 # drawn by long runs or from scans that are not here
 FROM_RUNS = {"overview.png", "real_scans.png", "sensor_effects.png"}
+OF_RECORDS = docs.record_pictures()
 ALIKE = 0.15  # another machine's letters differ by 0.02, another picture by more than 0.5
-
-
-@functools.cache
-def of_records() -> dict[str, Picture]:
-    """Every picture of the reproduction page that its records suffice to draw."""
-    parts = document(recorded(), "").parts
-    return {p.docs: p for p in parts if isinstance(p, Picture) and p.docs and p.draw}
 
 
 def ink(image: Image.Image) -> np.ndarray:
@@ -48,10 +38,10 @@ def pixels(figure: Figure) -> Image.Image:
     return Image.open(data)
 
 
-@pytest.mark.parametrize("name", sorted(of_records()))
+@pytest.mark.parametrize("name", sorted(OF_RECORDS))
 def test_a_committed_picture_is_its_records(name: str) -> None:
-    figure = of_records()[name].draw()
-    drawn, shown = pixels(figure), Image.open(DOCS / name)
+    figure = OF_RECORDS[name].draw()
+    drawn, shown = pixels(figure), Image.open(docs.DOCS / name)
     assert difference(drawn, shown) < ALIKE
     assert abs(drawn.height / drawn.width - shown.height / shown.width) < 0.01
     # legible in print
@@ -61,8 +51,8 @@ def test_a_committed_picture_is_its_records(name: str) -> None:
 
 
 def test_a_blank_a_shifted_and_another_picture_fail() -> None:
-    names = sorted(of_records())[:2]
-    one, other = (Image.open(DOCS / name).convert("RGB") for name in names)
+    names = sorted(OF_RECORDS)[:2]
+    one, other = (Image.open(docs.DOCS / name).convert("RGB") for name in names)
     assert difference(one, one) == 0
     assert difference(one, Image.new("RGB", one.size, "white")) > 5 * ALIKE
     assert difference(one, ImageChops.offset(one, one.width // 20, 0)) > ALIKE
@@ -71,19 +61,18 @@ def test_a_blank_a_shifted_and_another_picture_fail() -> None:
 
 
 def test_every_picture_of_the_pages_is_tested() -> None:
-    shown = {path.name for path in DOCS.glob("*.png")}
+    shown = {path.name for path in docs.DOCS.glob("*.png")}
     commanded = {name for name in shown if name.startswith("how_")}
-    assert shown == of_records().keys() | commanded | FROM_RUNS
+    assert shown == OF_RECORDS.keys() | commanded | FROM_RUNS
     for name in FROM_RUNS:
-        darkest = np.asarray(Image.open(DOCS / name).convert("RGB")).min(axis=-1)
+        darkest = np.asarray(Image.open(docs.DOCS / name).convert("RGB")).min(axis=-1)
         assert 0.05 < np.mean(darkest < 0.9 * 255) < 0.9, name
 
 
 @pytest.mark.slow
 def test_the_command_draws_what_the_pages_show(tmp_path: Path) -> None:
-    docs_pictures.main(docs_pictures.make_parser().parse_args(["--out", str(tmp_path)]))
-    drawn = {path.name for path in tmp_path.glob("*.png")}
-    assert drawn == {path.name for path in DOCS.glob("how_*.png")}
+    docs.draw(tmp_path)
+    drawn = {path.name for path in tmp_path.iterdir()}
+    assert drawn == {path.name for path in docs.DOCS.glob("*.png")} - FROM_RUNS
     for name in drawn:
-        assert difference(Image.open(tmp_path / name), Image.open(DOCS / name)) < ALIKE, name
-        assert (tmp_path / name).with_suffix(".pdf").stat().st_size > 5_000
+        assert difference(Image.open(tmp_path / name), Image.open(docs.DOCS / name)) < ALIKE, name

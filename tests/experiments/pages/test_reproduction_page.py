@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from experiments import reproduce
+from experiments import docs
 from experiments.pages.reproduction.document import PICTURES, Picture, document, to_markdown
 from experiments.pages.reproduction.page import to_html, to_page
 from experiments.pages.reproduction.studies import recorded
@@ -30,7 +30,7 @@ def page(tmp_path_factory) -> Path:
         for name in PICTURES:
             patch.setitem(PICTURES, name, small_picture)
         patch.setattr("experiments.studies.robustness.report.picture", small_picture)
-        path.write_text(to_page(document(recorded(), "Recorded.", docs=reproduce.DOCS)))
+        path.write_text(to_page(document(recorded(), "Recorded.", docs=docs.DOCS)))
     return path
 
 
@@ -114,7 +114,7 @@ def test_text_is_no_html(text) -> None:
 
 def test_what_is_folded_is_folded_in_both_writings() -> None:
     """The first look is claims and pictures: every raw table is closed."""
-    open_text = re.sub(r"<details.*?</details>", "", reproduce.docs_page(), flags=re.DOTALL)
+    open_text = re.sub(r"<details.*?</details>", "", docs.results_page(), flags=re.DOTALL)
     assert "```" not in open_text
     assert max(map(len, re.findall(r"(?:^\|.*\n)+", open_text, re.MULTILINE))) < 6000
     assert len(open_text.splitlines()) < 330

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from experiments import performance_page, results_page
+from experiments import docs
 from experiments.benchmarks.scaling import Series, summarize_scaling
 from experiments.benchmarks.timing import Figure, summarize
 from experiments.pages import blocks, tables
@@ -22,24 +22,23 @@ RECORDS = recorded()
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
 def test_the_pages_are_current(path) -> None:
-    """If this is red: python -m experiments.results_page"""
+    """If this is red: python -m experiments.docs"""
     text = path.read_text()
     assert page(path, RECORDS) == text
     for name in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text):
         assert (path.parent / name).stat().st_size > 10_000
 
 
-def test_the_commands_rewrite_the_pages(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(blocks, "write_text", lambda path, text: written.update({path: text}))
-    monkeypatch.setattr(results_page.reproduce, "write_docs", lambda: written.update(results=""))
-    for main, expected in (
-        (performance_page.main, {performance_page.PAGE}),
-        (results_page.main, {*PAGES, "results"}),
-    ):
-        written = {}
-        main()
-        assert set(written) == expected
-        assert all(text == path.read_text() for path, text in written.items() if text)
+def test_the_command_rewrites_the_pages_and_draws_if_asked(monkeypatch) -> None:
+    written, drawn = {}, []
+    for module in (blocks, docs):
+        monkeypatch.setattr(module, "write_text", written.__setitem__)
+    monkeypatch.setattr(docs, "draw", drawn.append)
+    docs.main(docs.make_parser().parse_args([]))
+    assert written == {path: path.read_text() for path in (*PAGES, docs.RESULTS_PAGE)}
+    assert not drawn
+    docs.main(docs.make_parser().parse_args(["--pictures"]))
+    assert drawn == [docs.DOCS]
 
 
 def changed(record: str, place: tuple, value: float) -> dict:

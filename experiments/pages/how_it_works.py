@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
-
 import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.runner import study_command as study
 from experiments.runner.evaluation_pictures import SURFACE_SAMPLES, shadow_picture
 from vanejax import plotting
 from vanejax.cad import InvestmentCasting, Part, as_cast, guide_vane
@@ -38,7 +35,9 @@ from vanejax.scanner import (
 )
 from vanejax.scans import MeasuredScan, clean_scan, segment
 from vanejax.training import TrainedMatcher, draw_pairs, find_weights, make_bank, make_scan_set
+from vanejax.training.weight_file import PRETRAINED
 
+SEED = 0
 VIEW = 20  # of the 216: elevation 60, azimuth 200 deg, a test view
 SHOWN = (0, 20, 85)  # views whose shadow is drawn
 
@@ -73,36 +72,34 @@ def viewpoints_picture(sphere: Viewpoints, printed: Viewpoints, center: np.ndarr
     return figure
 
 
-def registered(
-    scanner: Scanner, part: Part, views: Viewpoints, seed: int
-) -> tuple[PoseResult, MeasuredScan]:
+def registered(scanner: Scanner, part: Part, views: Viewpoints) -> tuple[PoseResult, MeasuredScan]:
     """One scan of the scanner's part by the paper's camera, registered to a CAD model."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     measured = measure(scanner, preset("paper_camera"), views.view(VIEW), rng)
     scan = clean_scan(measured.points)
-    return register(scan, part, seed=seed), scan
+    return register(scan, part, seed=SEED), scan
 
 
-def scene_picture(views: Viewpoints, seed: int) -> Figure:
+def scene_picture(views: Viewpoints) -> Figure:
     """A table, clamps and chips around the part, and what the segmentation takes for the part."""
     part = guide_vane()
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     scene = clutter_scene(part, Clutter(table=True, clamps=2, chips=12), rng)
     camera = Camera()
     scan = scene.scanner().scan(camera, views.view(VIEW))
-    segments = segment(scan.points.astype(np.float64), part, sensor_origin=np.zeros(3), seed=seed)
+    segments = segment(scan.points.astype(np.float64), part, sensor_origin=np.zeros(3), seed=SEED)
     return segments_picture(scan, camera, scene, segments)
 
 
-def matching_picture(matcher: TrainedMatcher, part: Part, views: Viewpoints, seed: int) -> Figure:
+def matching_picture(matcher: TrainedMatcher, part: Part, views: Viewpoints) -> Figure:
     """The soft assignment of a noisy test view by the untrained and by the trained network."""
     view = views.select(np.array([VIEW]))
     scans = make_scan_set(part, matcher.camera, view, voxel_mm=matcher.voxel_mm, progress=False)
     bank = make_bank(scans, num_reference=matcher.sampling.num_reference)
-    pairs = draw_pairs(jax.random.key(seed), bank, np.array([0]), matcher.sampling)
+    pairs = draw_pairs(jax.random.key(SEED), bank, np.array([0]), matcher.sampling)
     source, truth = jax.tree.map(lambda leaf: leaf[0], (pairs.source, pairs.target_from_source))
     model, start = matcher.model, RigidTransform.identity()
-    untrained = model.init(jax.random.key(seed), source, pairs.target, start, 1)
+    untrained = model.init(jax.random.key(SEED), source, pairs.target, start, 1)
     real = np.asarray(source.mask)
     place = part.radius * np.asarray(truth.apply(source.xyz))[real]
     target = part.radius * np.asarray(pairs.target.xyz)
@@ -114,46 +111,25 @@ def matching_picture(matcher: TrainedMatcher, part: Part, views: Viewpoints, see
     return matching_lines(shown)
 
 
-def main(settings: argparse.Namespace) -> None:
-    """Draws them all."""
+def pictures() -> dict[str, Figure]:
+    """By file name, all of them."""
     part = guide_vane()
     scanner = Scanner(part, surface_samples=SURFACE_SAMPLES)
     sphere = hemisphere_viewpoints(part.center)
     printed = hemisphere_viewpoints(part.center, formula="printed")
-    result, scan = registered(scanner, part, sphere, settings.seed)
+    result, scan = registered(scanner, part, sphere)
     cast, flatter = (
-        as_cast(part, InvestmentCasting(waviness_mm=wave), np.random.default_rng(settings.seed))
+        as_cast(part, InvestmentCasting(waviness_mm=wave), np.random.default_rng(SEED))
         for wave in (0.15, 0.1)
     )
-    of_cast, cast_scan = registered(Scanner(flatter), part, sphere, settings.seed)
-    figures = {
-        "how_viewpoints": viewpoints_picture(sphere, printed, part.center),
-        "how_shadow": shadow_picture(scanner, Camera(), sphere, SHOWN)[0],
-        "how_scene": scene_picture(sphere, settings.seed),
-        "how_casting": casting_map(part, cast),
-        "how_matching": matching_picture(
-            find_weights(settings.weights, part), part, sphere, settings.seed
-        ),
-        "how_deviation": plotting.deviation_map(result, scan, part),
-        "how_form": plotting.deviation_map(of_cast, cast_scan, part),
-        "how_residuals": plotting.residual_histogram(result),
+    of_cast, cast_scan = registered(Scanner(flatter), part, sphere)
+    return {
+        "how_viewpoints.png": viewpoints_picture(sphere, printed, part.center),
+        "how_shadow.png": shadow_picture(scanner, Camera(), sphere, SHOWN)[0],
+        "how_scene.png": scene_picture(sphere),
+        "how_casting.png": casting_map(part, cast),
+        "how_matching.png": matching_picture(find_weights(PRETRAINED, part), part, sphere),
+        "how_deviation.png": plotting.deviation_map(result, scan, part),
+        "how_form.png": plotting.deviation_map(of_cast, cast_scan, part),
+        "how_residuals.png": plotting.residual_histogram(result),
     }
-    settings.out.mkdir(parents=True, exist_ok=True)
-    for name, figure in figures.items():
-        plotting.save_figure(figure, settings.out / f"{name}.png")
-        print(settings.out / f"{name}.png")
-
-
-def make_parser() -> argparse.ArgumentParser:
-    """The command's arguments."""
-    parser = study.make_parser("docs_pictures", __doc__)
-    parser.add_argument(
-        "--weights",
-        default="pretrained",
-        help="an exported network of the guide vane (the one that comes with the package)",
-    )
-    return parser
-
-
-if __name__ == "__main__":
-    study.run(main, make_parser())
