@@ -54,8 +54,8 @@ class DeviationMaps(NamedTuple):
       sides: from where they are seen.
       pictures: of each side a picture for each map.
       limit_mm: where the colours of all of them end.
-      below_share, above_share: of the checked points, those beyond the colours in the last map: no
-        difference that was found explains them.
+      below_share, above_share: of the checked points, those beyond the colours in the last map:
+        noise, what is near an edge, and what no difference that was found explains.
       lost_share: of the checked points, those without a partner on the part.
     """
 
