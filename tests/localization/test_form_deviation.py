@@ -26,6 +26,7 @@ from vanejax.errors import InputError
 from vanejax.localization.covariance import uncertainty
 from vanejax.localization.fine_registration import refine
 from vanejax.localization.form_deviation import (
+    CLEAR_MM,
     as_designed,
     check_lengths,
     scaled_pose,
@@ -122,6 +123,23 @@ def test_a_bend_of_the_range_is_counted_in_sigma():
     plain = refine(model(vane()), points, truth)
     before, after = (pose_error(vane(), r.part_from_camera, truth) for r in (plain, found))
     assert after[0] < 0.7 * before[0]
+
+
+@pytest.mark.parametrize(("bend_mm", "stays"), [(0.1, False), (0.8, True)])
+def test_a_large_rest_alone_leaves_the_pose_of_all_points(bend_mm: float, stays: bool):
+    """Nothing is known of it but its size; a small one is known well enough to move the pose."""
+    points, truth = measured_points(vane(), camera=MIDDLE)
+    across = points[:, 0] / points[:, 2]
+    across = (across - across.mean()) / np.ptp(across)
+    bend = bend_mm * np.cos(4 * np.pi * across)
+    points *= 1 + bend[:, None] / np.linalg.norm(points, axis=1, keepdims=True)
+    plain = refine(model(vane()), points, truth)
+    found = with_form_deviation(model(vane()), points, plain)
+    form = found.form
+    assert not any((form.stock_mm, form.scale_error, form.focal_error))
+    assert (form.field_mm > CLEAR_MM) == stays
+    same = found.part_from_camera.translation == plain.part_from_camera.translation
+    assert np.all(same) == stays
 
 
 @pytest.mark.parametrize("pixels", [0.5, -0.3])

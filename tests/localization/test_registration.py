@@ -8,6 +8,7 @@ import functools
 import numpy as np
 import pytest
 import trimesh
+from example_result import example_result
 from example_scans import (
     MIDDLE,
     batch,
@@ -287,6 +288,27 @@ def test_a_scan_that_was_moved_is_found_by_its_shape():
     assert result.sensor_origin is None
     told = register(frame.apply(points), bracket(), init=init, sensor_origin="unknown")
     assert told.verdict.status == "accepted"
+
+
+@pytest.mark.parametrize(("share", "status"), [(0.9, "ambiguous"), (1.1, "rejected")])
+def test_a_shape_that_fits_loosely_is_no_reason_to_doubt_the_sensors_place(
+    monkeypatch, share, status
+):
+    """``share`` is of the noise up to which the fit without rays counts."""
+    tolerance_mm = 3 * share * Limits().doubtful_noise * bracket().radius
+
+    def fits_without_rays(scan, task, rotations) -> PoseResult:
+        if scan.sensor_origin is not None:
+            return example_result("rejected")
+        loose = example_result("accepted", sensor=False)
+        checks = dataclasses.replace(loose.verification, tolerance_mm=tolerance_mm)
+        return dataclasses.replace(loose, verification=checks)
+
+    monkeypatch.setattr(registration, "_register_points", fits_without_rays)
+    monkeypatch.setattr(registration, "_other_shapes", lambda *_: ())
+    result = register(scan_of("bracket", 1)[0], bracket(), segment="off")
+    assert result.verdict.status == status
+    assert ("were the sensor's place unknown" in result.verdict.reason) == (status == "ambiguous")
 
 
 def test_a_sensor_as_given_is_not_doubted():
