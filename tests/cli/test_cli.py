@@ -297,10 +297,10 @@ def test_bad_input_is_one_line_and_no_work(
 
 
 def test_trouble_on_the_way_is_one_line_and_a_bug_is_not_hidden(files, fake, capsys) -> None:
-    full = OSError(errno.ENOSPC, "No space left on device", "/tmp/x")
+    full = OSError(errno.ENOSPC, "No space left on device", "pose.json")
     for trouble, code, words in (
         (KeyboardInterrupt(), 130, "interrupted"),
-        (full, 1, "error: /tmp/x: No space left on device"),
+        (full, 1, "error: pose.json: No space left on device"),
         (MemoryError(), 1, "error: not enough memory"),
     ):
         fake(trouble)
