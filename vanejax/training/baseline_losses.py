@@ -99,12 +99,13 @@ class DcpLoss(Settings):
         return mean_over_pairs(of_pair, (variables, embedding), pairs)
 
 
+@settings_class
 class _IterationsLoss(Settings):
     """The discounted sum of the parts of a loss over the iterations of a network."""
 
-    iterations: int
-    discount: float
-    pairs_at_once: int
+    iterations: int = positive(10)
+    discount: float = not_negative(0.5)
+    pairs_at_once: int = positive(1)
 
     def of_iterations(self, steps: Any, pair: Pair) -> tuple[RigidTransform, Metrics]:
         """The poses [I] that a network found for one pair, and the parts [I] of the loss."""
@@ -147,11 +148,8 @@ class PointNetLKLoss(_IterationsLoss):
       residual: factor of the mean square of the features' residual.
     """
 
-    iterations: int = positive(10)
-    discount: float = not_negative(0.5)
     matrix: float = factor(1.0)
     residual: float = factor(0.0)
-    pairs_at_once: int = positive(1)
 
     def of_iterations(self, steps: LucasKanadeSteps, pair: Pair) -> tuple[RigidTransform, Metrics]:
         """Poses [I] and parts [I]."""
@@ -178,10 +176,8 @@ class PcrNetLoss(_IterationsLoss):
     """
 
     iterations: int = positive(8)
-    discount: float = not_negative(0.5)
     pose: float = factor(1.0)
     chamfer: float = factor(0.0)
-    pairs_at_once: int = positive(1)
 
     def of_iterations(self, steps: RigidTransform, pair: Pair) -> tuple[RigidTransform, Metrics]:
         """Poses [I] and parts [I]."""
