@@ -314,9 +314,10 @@ def test_the_files_that_the_architecture_names_are_there() -> None:
     assert re.findall(r"^\| `vanejax\.(\w+)` \|", page, re.MULTILINE) == WINGS
 
 
-def test_the_modules_that_pages_name_are_there() -> None:
+def test_what_pages_and_docstrings_name_is_there() -> None:
+    sources = [path for name in ("vanejax", "experiments") for path in (ROOT / name).rglob("*.py")]
     missing = []
-    for page in PAGES:
+    for page in [*PAGES, *sources]:
         for name in re.findall(r"`((?:vanejax|experiments)(?:\.\w+)+)[`(]", page.read_text()):
             parts = name.split(".")
             for length in range(len(parts), 0, -1):

@@ -1,9 +1,9 @@
 """What a stereo camera's matching window rounds off, taken out of a scan of a part of known shape.
 
 Stereo finds the mean depth of a window, so that outer edges are measured too far and inner ones too
-near (`vanejax.scanner.range_errors.windowed`), over a millimetre deep with a coarse camera. That is
-no noise: it pulls the pose. At a pose that is about right, the virtual sensor says by how much each
-pixel is off, and the fine registration goes on from the points without it.
+near (`vanejax.scanner.range_errors.window_mean`), over a millimetre deep with a coarse camera. That
+is no noise: it pulls the pose. At a pose that is about right, the virtual sensor says by how much
+each pixel is off, and the fine registration goes on from the points without it.
 """
 
 from __future__ import annotations
