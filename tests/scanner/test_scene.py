@@ -35,10 +35,6 @@ def full() -> ClutterScene:
     return clutter_scene(vane(), FULL, np.random.default_rng([0, 1]))
 
 
-def of_kind(scene: ClutterScene, kind: str) -> list[trimesh.Trimesh]:
-    return [item.mesh for item in scene.objects if item.kind == kind]
-
-
 def test_no_clutter_is_the_bare_part_bit_for_bit():
     scene = clutter_scene(vane(), Clutter(), np.random.default_rng(0))
     assert scene.objects == ()

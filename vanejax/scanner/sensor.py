@@ -127,17 +127,17 @@ class Sensor:
         longer = dataclasses.replace(self.exposure, exposure_ms=factor * self.exposure.exposure_ms)
         return dataclasses.replace(self, exposure=longer)
 
-    def sample(self, rng: np.random.Generator, *, spread: float = 0.3) -> Sensor:
+    def sample(self, rng: np.random.Generator) -> Sensor:
         """Another camera of this kind, as its maker's next one would be.
 
         Errors of calibration are normally distributed with this sensor's as standard deviations;
         all other magnitudes, light and finish of the surface among them, are multiplied by the
-        exponential of a normal number of standard deviation ``spread``. Settings of the matching,
-        such as its window, stay.
+        exponential of a normal number of standard deviation 0.3. Settings of the matching, such as
+        its window, stay.
         """
 
         def vary(value: float) -> float:
-            return value * math.exp(spread * rng.standard_normal())
+            return value * math.exp(0.3 * rng.standard_normal())
 
         def normal(value: float) -> float:
             return value * rng.standard_normal()

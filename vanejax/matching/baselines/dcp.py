@@ -140,11 +140,9 @@ def last_match(
     init: RigidTransform,
     *,
     iterations: int,
-    target_embedding: Embedding | None = None,
 ) -> Match:
-    """The last of several iterations, at least 1; pairs can share what `Dcp.embed` gives."""
-    if target_embedding is None:
-        target_embedding = model.apply(variables, target, method="embed")
+    """The last of several iterations, at least 1."""
+    target_embedding = model.apply(variables, target, method="embed")
 
     def match(pose: RigidTransform) -> Match:
         return model.apply(variables, source, target, target_embedding, pose, method="match")
