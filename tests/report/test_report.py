@@ -184,7 +184,7 @@ def test_what_is_unknown_is_said_to_be(tmp_path):
     for words in (
         "place unknown", "The sensor's place is unknown, so its rays are too", "undetermined",
         "no single direction", "Behind it .{0,80} unknown", "Unmeasured .{0,80} unknown",
-        "Nothing was assumed, dropped or repaired.",
+        "Nothing was assumed, dropped or repaired.", "From the measured side", "nearest surface",
     ):  # fmt: skip
         assert re.search(words, text), words
     assert not re.search(r"\b(nan|inf|None)\b", text)
@@ -226,7 +226,7 @@ def test_the_form_has_a_section_with_figures(tmp_path):
         "0.503 ± 0.003 mm", "1.010 ± 0.010 % smaller", "0.16 mm over 29 mm", "2.0 %", "0.4 %",
         "stock on a few faces", "did not converge",
         "Found: stock 0.503 ± 0.003 mm; the scan is", "Without stock and the difference of size",
-        "Each colour is drawn where the sensor should have met the CAD model.",
+        "Each colour is drawn where the sensor should have met the surface of the CAD model.",
     ):  # fmt: skip
         assert words in page.text, words
     images = [a["alt"] or "" for t, a in page.elements if t == "img"]

@@ -260,10 +260,11 @@ def deviation_maps(result: PoseResult, scan: MeasuredScan, scene: Scene) -> Devi
         ]
         pictures.append(tuple(row))
     side = "left" if oblique["yaw_deg"] > 0 else "right"
+    front = "measured" if scan.sensor_origin is None else "sensor's"
     count = max(len(last), 1)
     return DeviationMaps(
         tuple(cloud.title for cloud in clouds),
-        ("from the sensor's side", f"from further {side} and above"),
+        (f"from the {front} side", f"from further {side} and above"),
         tuple(pictures),
         limit,
         below_share=float(np.count_nonzero(last < -limit) / count),
