@@ -136,6 +136,12 @@ def test_what_leaves_much_open_fits_badly():
     assert fits_badly(ambiguous(inlier_share=0.65))
     assert not fits_badly(ambiguous(unmeasured_share=0.5))  # a crop that lies on the part
     assert fits_badly(ambiguous(tolerance_mm=0.07 * vane().radius))
+    large = FormDeviation(scale_error=0.07)  # it is named in the verdict already
+    result = ambiguous(inlier_share=0.95, unmeasured_share=0.0)
+    refinement = dataclasses.replace(result.refinement, form=large)
+    verdict = Verdict("rejected", "the scan is 7.0% larger")
+    result = dataclasses.replace(result, refinement=refinement, verdict=verdict)
+    assert not fits_badly(result)
     for form in (FormDeviation(converged=False), FormDeviation(unexplained_share=0.06)):
         result = ambiguous()
         refinement = dataclasses.replace(result.refinement, form=form)
@@ -151,3 +157,21 @@ def test_the_mirrored_bracket_is_called_that_with_and_without_stock(scan):
     result = register(load_scan(CASES / scan, units="mm"), part)
     assert result.verdict.status == "rejected"
     assert "fits the mirror image of the CAD model" in result.verdict.reason
+
+
+def test_another_shape_that_fits_poorly_too_is_not_named(monkeypatch):
+    """As of another part: its mirror image may fit a little better, and is as wrong."""
+    scan, truth = scan_of_vane()
+    poor = ambiguous(inlier_share=0.65, unmeasured_share=0.0)
+    rejected = dataclasses.replace(ambiguous(inlier_share=0.5), verdict=Verdict("rejected", "so"))
+    tried = []
+
+    def localize(model, scan, candidates, task) -> PoseResult:
+        tried.append(scan)
+        return rejected if len(tried) == 1 else poor
+
+    monkeypatch.setattr(registration, "_localize", localize)
+    monkeypatch.setattr(registration, "_other_shapes", lambda *_: [(-1.0, scan, None)])
+    result = register(scan, vane(), init=truth, segment="off")
+    assert len(tried) == 2
+    assert result.verdict.reason == "so"

@@ -63,16 +63,26 @@ def times(scan: MeasuredScan, factor: float) -> MeasuredScan:
 def fits_badly(result: PoseResult, part: Part, limits: Limits) -> bool:
     """Whether the scan leaves so much open that it may be of another shape than the part.
 
-    A crop that lies on the part does not.
+    A crop that lies on the part does not, nor does a part whose other size is known already.
     """
-    if result.verdict.status != "ambiguous":
-        return result.verdict.status == "rejected"
     checks, form = result.verification, result.refinement.form
+    if result.verdict.status != "ambiguous":
+        return result.verdict.status == "rejected" and not has_other_size(result, limits)
     return (
         (checks.support < limits.least_support and checks.inlier_share < ON_THE_PART)
         or checks.tolerance_mm / 3 > limits.doubtful_noise * part.radius
         or (form is not None and form.unexplained_share > limits.most_unexplained_share)
         or (form is not None and not form.converged)
+    )
+
+
+def has_other_size(result: PoseResult, limits: Limits) -> bool:
+    """Whether a result is of a part that fits well, but for a size that is not its own."""
+    form = result.refinement.form
+    return (
+        form is not None
+        and abs(form.scale_error) > limits.most_scale_error
+        and result.verification.support >= limits.least_support
     )
 
 

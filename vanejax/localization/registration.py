@@ -153,10 +153,9 @@ class _Task:
 
     def is_sound(self, result: PoseResult) -> bool:
         """Whether a pose explains the scan so well that nothing else need be tried."""
-        return (
-            result.verdict.status != "rejected"
-            and result.verification.support >= self.limits.least_support
-        )
+        if result.verdict.status == "rejected":
+            return misfit.has_other_size(result, self.limits)
+        return result.verification.support >= self.limits.least_support
 
     def rank(self, result: PoseResult) -> tuple[bool, int, float]:
         """The largest is the best result."""
@@ -181,7 +180,7 @@ def _name_other_shape(
         scaled = misfit.times(shown, factor)
         model = measurement_model(task.part, scaled.sensor_origin)
         other = _localize(model, scaled, candidates, task.without_hints())
-        if task.rank(other) > task.rank(result):
+        if task.is_sound(other) and task.rank(other) > task.rank(result):
             verdict = Verdict("rejected", misfit.in_words(factor, other, result))
             return dataclasses.replace(result, verdict=verdict, alternatives=())
     return result
