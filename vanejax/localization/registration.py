@@ -174,7 +174,8 @@ def _name_other_shape(
       seen: what of it the result is of.
       task: what `register` was asked for.
     """
-    if not misfit.fits_badly(result, task.part, task.limits):
+    refused_by_rays = seen.sensor_origin is not None and result.sensor_origin is None
+    if not refused_by_rays and not misfit.fits_badly(result, task.part, task.limits):
         return result
     for factor, shown, candidates in _other_shapes(result, scan, seen, task):
         scaled = misfit.times(shown, factor)
