@@ -232,6 +232,8 @@ def test_limits_are_respected(limits, case):
 def test_points_off_the_part_outweigh_other_poses():
     """Another part is seldom in one pose; of a crop the other poses are what counts."""
     assert verdict(inlier_share=0.65, competing=[other(0.0)]).reason.startswith("only 65%")
+    half = verdict(inlier_share=0.78, unmeasured_share=0.36, competing=[other(0.0)])
+    assert half.reason.startswith("only 78%")
     crop = verdict(inlier_share=0.97, unmeasured_share=0.4, competing=[other(0.0)])
     assert "another pose" in crop.reason
     crop = verdict(inlier_share=0.97, unmeasured_share=0.4)

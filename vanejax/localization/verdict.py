@@ -208,7 +208,8 @@ def _doubts(
     limits: Limits,
 ) -> Iterator[str]:
     """Why a pose without fault may still be another one, the gravest first."""
-    off_the_part = verification.inlier_share < limits.least_support
+    weak = verification.support < limits.least_support
+    off_the_part = weak and verification.inlier_share < MOST_OF_THEM
     if off_the_part:
         yield _weak_support(verification)
     near = [other for other in competing if other.preference < limits.least_preference]
@@ -222,7 +223,7 @@ def _doubts(
             f"{best.translation_mm:.2f} mm; a view that shows where they differ, or a rough pose, "
             "decides"
         )
-    if verification.support < limits.least_support and not off_the_part:
+    if weak and not off_the_part:
         yield _weak_support(verification)
     noise = verification.tolerance_mm / 3
     if noise > limits.doubtful_noise * radius_mm:
