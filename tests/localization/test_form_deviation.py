@@ -94,6 +94,21 @@ def test_a_wrong_focal_length_is_found_and_costs_little():
     assert max(pose_error(vane(), found.part_from_camera, truth)) < 0.01
 
 
+def test_much_stock_is_found_from_where_least_squares_ends():
+    """Some 1.4 mm off, with many points on another face than they seem."""
+    casting = InvestmentCasting(allowance_mm=1.0, waviness_mm=0.0)
+    cast = as_cast(vane(), casting, np.random.default_rng(0))
+    _, truth = ideal_scan(vane(), camera=MIDDLE)
+    scan = Scanner(cast).scan(MIDDLE, truth.inverse())
+    points = with_noise(scan.points.astype(np.float64), 0.02, 0)
+    plain = refine(model(vane()), points, truth)
+    assert pose_error(vane(), plain.part_from_camera, truth)[1] > 0.5
+    found = with_form_deviation(model(vane()), points, plain)
+    assert found.form.converged
+    assert found.form.stock_mm == pytest.approx(1.0, abs=0.02)
+    assert max(pose_error(vane(), found.part_from_camera, truth)) < 0.02
+
+
 @pytest.mark.slow
 def test_stock_that_varies_is_counted_in_sigma():
     casting = InvestmentCasting(allowance_mm=0.3, waviness_mm=0.1, wavelength_mm=30.0)
@@ -108,8 +123,8 @@ def test_stock_that_varies_is_counted_in_sigma():
         before.append(pose_error(vane(), plain.part_from_camera, truth)[1])
         after.append(pose_error(vane(), found.part_from_camera, truth)[1])
         ratios.append(squared_error(found, truth))
-    assert np.mean(after) < 0.2 * np.mean(before)
-    assert np.mean(ratios) < 3
+    assert np.mean(after) < 0.1 * np.mean(before)
+    assert np.mean(ratios) < 2
 
 
 def test_a_bend_of_the_range_is_counted_in_sigma():
@@ -150,6 +165,7 @@ def test_an_error_of_calibration_counts_where_it_is_given(pixels):
     calibration = Calibration(MIDDLE, lens=Lens(center_error_px=(0.5, 0.5)))
     known = registered(points + shift, truth, calibration=calibration)
     plain = refine(model(vane()), points + shift, truth)
+    assert known.form.converged
     assert squared_error(known, truth) < 3
     assert squared_error(plain, truth) > 30
     bounds = [uncertainty(r, vane().center).translation_bound_mm for r in (plain, known)]

@@ -140,6 +140,33 @@ def test_a_patch_that_nothing_explains_does_not_count():
     assert found.mean[3] == pytest.approx(0.05, abs=0.01)
 
 
+def test_patches_on_another_face_are_no_field():
+    """A field that is large and short would explain them, and the stock with them."""
+    truth = np.array([0, 0, 0, 0.05, 0, 0, 0.5, 0, 0])
+    scan = deviating(truth)
+    wrong = np.random.default_rng(1).choice(len(scan), len(scan) // 10, replace=False)
+    scan.deviation_mm[wrong] += np.linspace(0.3, 1.5, len(wrong))
+    found = average_models(scan, np.zeros(3), prior())
+    np.testing.assert_array_equal(np.flatnonzero(found.outliers), np.sort(wrong))
+    off = found.mean[[3, 6]] - truth[[3, 6]]
+    assert np.abs(off).max() < 0.02
+
+
+def test_errors_of_calibration_that_are_taken_out_already_are_counted_from_there():
+    error = np.sin(patches().positions[:, :1] / 20)  # mm, one standard deviation
+    clean = dataclasses.replace(patches(), columns=np.hstack([patches().columns, error]))
+    whole, half = (
+        average_models(
+            dataclasses.replace(clean, deviation_mm=left * error[:, 0]),
+            np.array([0, 0, 0, 0.8 - left]),
+            prior(),
+        )
+        for left in (0.8, 0.4)
+    )
+    assert 0.8 - 0.4 + half.mean[9] == pytest.approx(whole.mean[9], abs=1e-4)
+    assert whole.mean[9] == pytest.approx(0.8, abs=0.01)
+
+
 def test_a_known_tolerance_counts_where_the_scan_shows_nothing():
     scan = deviating(np.zeros(9))
     free = average_models(scan, np.zeros(3), prior())

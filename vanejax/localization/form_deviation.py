@@ -12,6 +12,7 @@ import dataclasses
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from vanejax.errors import InputError
@@ -29,17 +30,20 @@ PATCHES = 160
 SURFACE_POINTS = 200
 LEAST_PATCHES, LEAST_POINTS = 20, 3  # points of each patch
 CONVERGED = 0.25  # standard deviations of the pose: outliers come and go by less
+BY_CHANCE = 17.0  # of six squared deviations, one sum in a hundred is larger
 # mm, and of the part's radius: what is farther off is not on the part
 MOST_DEVIATION_MM, MOST_DEVIATION = 2.0, 0.03
 # patches keep this far from edges, and 1.5 times as far as the surface is off
 MARGINS_MM = (0.3, 1.2)
 SAME_FACE_DEG = 25.0
+SAME_NORMAL = 0.75  # squared cosine
 FLATTEST = 0.1  # cosine of incidence
 NEAR = 4.0  # standard deviations within a patch
 MOST_STEP_DEG, MOST_STEP = 2.0, 0.03  # an iteration turns and moves by no more (of the radius)
 STOCK_ITERATIONS = 2  # the face under the stock is not quite where the ray through it ends
 # other starts, and how large a field must be to try them
 STOCK_GUESSES_MM, CLEAR_MM = (0.7,), 0.25
+ROUGH = 0.2  # of the part's radius: a field over no more is not smooth
 LIKELY = 0.5  # a term more probable than this is taken to be there
 # how many times more than elsewhere all points may know in a direction than those on smooth faces:
 # what is beyond comes from edges, and of a casting they are that far off
@@ -47,6 +51,8 @@ MOST_BY_EDGES, EDGE_MM = 30.0, 0.4
 BEYOND_MM = 3.0
 # of the stock: how well the points under it are known where the surface is curved
 STOCK_TRUENESS = 0.005
+# of the field: it is taken to be small, and moves where a ray ends
+FIELD_TRUENESS = 0.01
 # of scale times distance: a scan does not tell a large part from a camera with a wrong scale, which
 # would move the pose along the line of sight by that much; the bounds at 1.96 sigma hold for both
 SCALE_SIGMA = 0.6
@@ -68,14 +74,24 @@ def check_lengths(max_allowance_mm: float | None, form_tolerance_mm: float | Non
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _State:
-    """A pose of the scan divided by 1 + scale, and the terms [3], see `random_fields.TERMS`."""
+    """A pose of the scan divided by 1 + scale, and what the scan differs by.
+
+    ``terms`` [3], see `random_fields.TERMS`; ``errors`` [C] of the calibration, in standard
+    deviations.
+    """
 
     pose: RigidTransform
     terms: np.ndarray
+    errors: np.ndarray
 
     @property
     def factor(self) -> float:
         return 1 + self.terms[1]
+
+    @property
+    def differences(self) -> np.ndarray:
+        """[3 + C], terms and errors."""
+        return np.concatenate([self.terms, self.errors])
 
 
 def with_form_deviation(
@@ -115,7 +131,7 @@ def with_form_deviation(
     sample = points[subset(points, POINTS, seed + 6)]
     fit = _Fit(model, sample, calibration)
     with threadpool_limits(1):  # the matrices are small: threads would wait for each other
-        estimate = fit.converge(_State(refinement.part_from_camera, np.zeros(3)), prior)
+        estimate = fit.converge(fit.start(refinement.part_from_camera), prior)
         # least squares may have locked onto a few faces of a casting with much stock
         for stock_mm in () if prior.stock_mm == 0 else STOCK_GUESSES_MM:
             if estimate is None or _is_clear(*estimate[1:]):
@@ -143,6 +159,12 @@ def _is_clear(average: Average, converged: bool) -> bool:
     return converged and average.field.kind != "facing" and average.amplitude_mm <= CLEAR_MM
 
 
+def _squared(average: Average) -> float:
+    """The squared motion over its covariance."""
+    motion = average.mean[:6]
+    return float(motion @ np.linalg.solve(average.covariance[:6, :6], motion))
+
+
 class _Fit:
     """The estimation of one scan of one part."""
 
@@ -150,22 +172,32 @@ class _Fit:
         self, model: MeasurementModel, points: np.ndarray, calibration: Calibration | None
     ) -> None:
         self.model, self.points = model, points
-        self.moves = None if calibration is None else calibration.displacements(points)
+        # [C, n, 3] mm
+        self.moves = np.zeros((0, *points.shape))
+        if calibration is not None:
+            self.moves = calibration.displacements(points)
 
-    def start(self, pose: RigidTransform, stock_mm: float) -> _State:
+    def start(self, pose: RigidTransform, stock_mm: float = 0.0) -> _State:
         """A pose near one for a part with that much stock."""
         terms = np.array([stock_mm, 0.0, 0.0])
-        for _ in range(2):
+        for _ in range(2 if stock_mm else 0):
             model, points = as_designed(self.model, self.points, pose, terms)
             poses, _ = robust_gauss_newton(model, stack(pose), points[::5], iterations=8)
             pose = select(poses, 0)
-        return _State(pose, terms)
+        return _State(pose, terms, np.zeros(len(self.moves)))
+
+    def _measured(self, state: _State) -> np.ndarray:
+        """[n, 3] mm, camera frame: the points without the errors of the calibration."""
+        return self.points - np.einsum("c,cni->ni", state.errors, self.moves)
 
     def converge(self, state: _State, prior: Prior) -> tuple[_State, Average, bool] | None:
         """From a state to that at which the average over all models stays; None: too few patches.
 
         Also whether it stayed.
         """
+        quick = self._as_designed_already(state, prior)
+        if quick is not None:
+            return state, quick, True
         margin, average, converged = MARGINS_MM[1], None, False
         # far from the solution a rich model explains points of another face
         for kinds, most in ((("form",), 3), (prior.kinds[:-1], 5), (prior.kinds, 4)):
@@ -174,16 +206,23 @@ class _Fit:
                 patches, size = self._patches(state, margin)
                 if patches is None:
                     return None if average is None else (state, average, False)
-                average = average_models(patches, state.terms, stage)
+                average = average_models(patches, state.differences, stage)
                 state = _step(self.model, state, average.mean)
                 # nearer to the edges there may be small faces that say more
                 before, margin = margin, float(np.clip(1.5 * size, *MARGINS_MM))
-                motion = average.mean[:6]
-                squared = motion @ np.linalg.solve(average.covariance[:6, :6], motion)
-                converged = bool(squared < CONVERGED**2 * 6 and margin > 0.7 * before)
+                converged = _squared(average) < 6 * CONVERGED**2 and margin > 0.7 * before
                 if converged:
                     break
         return state, average, converged
+
+    def _as_designed_already(self, state: _State, prior: Prior) -> Average | None:
+        """The average at a state where there is nothing to estimate; else None."""
+        patches, size = self._patches(state, MARGINS_MM[0])
+        if patches is None or 1.5 * size > MARGINS_MM[1] / 2:
+            return None
+        average = average_models(patches, state.differences, prior)
+        some = average.term_probability.max() > LIKELY or average.field_probability > LIKELY
+        return None if some or _squared(average) > BY_CHANCE else average
 
     def beyond_edges(self, state: _State, noise_mm: float, count: int) -> float:
         """Share of the points beside the part, by more than their spacing and noise let them be.
@@ -191,7 +230,7 @@ class _Fit:
         By no more than `BEYOND_MM` either: what is farther off is clutter. ``count`` is of the
         whole scan. Stock on one side shows here, where all that is seen of the faces looks moved.
         """
-        model, points = as_designed(self.model, self.points, state.pose, state.terms)
+        model, points = as_designed(self.model, self._measured(state), state.pose, state.terms)
         residuals = model.residuals(stack(state.pose), points)
         near = cKDTree(points).query(points[::10], k=2)[0][:, 1]
         spacing_mm = np.median(near) * np.sqrt(len(points) / count)
@@ -205,7 +244,7 @@ class _Fit:
         None where there are too few.
         """
         pose = stack(state.pose)
-        model, points = as_designed(self.model, self.points, state.pose, state.terms)
+        model, points = as_designed(self.model, self._measured(state), state.pose, state.terms)
         part = model.part
         residuals = model.residuals(pose, points)
         deviation, normals = residuals.deviation_mm[0], residuals.jacobian[0][:, 3:]
@@ -213,6 +252,11 @@ class _Fit:
         used = residuals.hit[0] & (cosine > FLATTEST)
         used &= np.abs(deviation) < max(MOST_DEVIATION_MM, MOST_DEVIATION * part.radius)
         used &= _smooth(model, points, pose, margin_mm)
+        # `as_designed` may have moved a point along the normal of another face than it ends at
+        shift = (self._measured(state) / state.factor - points) @ pose.rotation[0].T
+        squared = np.sum(shift**2, axis=1)
+        along = np.sum(normals * shift, axis=1)
+        used &= (along**2 >= SAME_NORMAL * squared) & ((squared > 0) | (state.terms[0] == 0))
         if np.count_nonzero(used) < LEAST_PATCHES * LEAST_POINTS:
             return None, 0.0
         columns = self._columns(model, points, pose, residuals)[used]
@@ -265,10 +309,8 @@ class _Fit:
         place = pose.apply(points[None])[0] - model.part.center
         scale = np.sum(normals * place, axis=1)
         focal = np.sum(in_camera * across_sight(model, points), axis=1)
-        columns = [jacobian, np.ones(len(points)), scale, focal]
-        if self.moves is not None:
-            columns.append(np.einsum("ni,cni->nc", in_camera, self.moves))
-        return np.column_stack(columns)
+        errors = np.einsum("ni,cni->nc", in_camera, self.moves)
+        return np.column_stack([jacobian, np.ones(len(points)), scale, focal, errors])
 
 
 def as_designed(
@@ -291,11 +333,13 @@ def as_designed(
         # not from the deviations: where the surface is curved, a ray meets the CAD model elsewhere
         # than under the stock that it ends at
         scanned, sideways = points, across_sight(model, points)
+        shift = np.zeros_like(points)
         for _ in range(STOCK_ITERATIONS):
             residuals = model.residuals(stack(part_from_camera), points)
             normals = residuals.jacobian[0][:, 3:] @ part_from_camera.rotation
             offset = stock + focal * np.sum(normals * sideways, axis=1)
-            points = scanned - np.where(residuals.hit[0], offset, 0.0)[:, None] * normals
+            shift = np.where(residuals.hit[0][:, None], offset[:, None] * normals, shift)
+            points = scanned - shift
     return model, points
 
 
@@ -324,15 +368,23 @@ def scaled_pose(
     return RigidTransform(rotation, center - rotation @ in_camera)
 
 
+def _motion(first: RigidTransform, second: RigidTransform, center: np.ndarray) -> np.ndarray:
+    """[6] rotation vector in rad and translation in mm about the centre, from one to the other."""
+    between = second @ first.inverse()
+    turn = Rotation.from_matrix(between.rotation).as_rotvec()
+    return np.concatenate([turn, between.apply(center[None])[0] - center])
+
+
 def _step(model: MeasurementModel, state: _State, mean: np.ndarray) -> _State:
     """The state after a step, no longer than `MOST_STEP`."""
     turn, shift = np.linalg.norm(mean[:3]), np.linalg.norm(mean[3:6])
     most = max(turn / np.radians(MOST_STEP_DEG), shift / (MOST_STEP * model.part.radius), 1.0)
     pose = select(moved(model.part, stack(state.pose), -mean[None, :6] / most), 0)
-    terms = state.terms + mean[6:] / most
+    terms = state.terms + mean[6:9] / most
+    errors = state.errors + mean[9:] / most
     # a larger part stays where it is
     factor = state.factor / (1 + terms[1])
-    return _State(scaled_pose(pose, model.part.center, factor), terms)
+    return _State(scaled_pose(pose, model.part.center, factor), terms, errors)
 
 
 def _smooth(
@@ -431,13 +483,20 @@ def _result(
     if stock:
         by_stock = average.covariance[:6, 6] / average.covariance[6, 6]
         covariance += (STOCK_TRUENESS * stock) ** 2 * np.outer(by_stock, by_stock)
+    if form.field in ("form", "displacement"):
+        sides = np.repeat([1 / model.part.radius, 1.0], 3)
+        covariance += np.diag((FIELD_TRUENESS * form.field_mm * sides) ** 2)
     if scale and isinstance(model, RayCasting):
         in_camera = pose.inverse().apply(model.part.center[None])[0] - model.sensor_origin
         sight = SCALE_SIGMA * scale * (pose.rotation @ in_camera)
         covariance[3:, 3:] += np.outer(sight, sight)
-    # of so large a rest nothing but its size is known: the pose of all points is as good
-    if form.field_mm > CLEAR_MM and not present.any():
-        pose = refinement.part_from_camera
+    # so large a rest that is not smooth is no form: the pose of all points is as good
+    rough = average.field.length <= ROUGH and form.field in ("form", "displacement", "range")
+    if rough and form.field_mm > CLEAR_MM and not present.any():
+        other = refinement.part_from_camera
+        apart = _motion(pose, other, model.part.center)
+        covariance += np.outer(apart, apart)
+        pose = other
     return dataclasses.replace(
         refinement,
         part_from_camera=pose,

@@ -23,6 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vanejax.scans.robust_statistics import robust_sigma
+
 TERMS = ("stock", "scale", "focal")  # mm; relative; relative
 TERM_SIGMAS = np.array([0.5, 0.01, 0.003])  # before the scan is seen
 MODELS_OF_TERMS = ((), (0,), (1,), (2,), (0, 1), (0, 2))
@@ -34,12 +36,18 @@ LEFT_MOTION = 0.3
 FACING_WIDTH = 0.1  # of 1 - cosine, between faces that share an offset
 # amplitudes of the field, mm, where the noise is white
 AMPLITUDES = np.geomspace(1e-3, 1.0, 13)
+# of the stock, where there is any: its variation, and by what factor e that may be another
+SHARE, SHARE_SIGMA, LEAST_STOCK_MM = 0.2, 1.1, 0.05
 INFLATIONS = np.array([1, 1.6, 2.5, 4, 8, 16, 40, 100.0])  # of the noise's variance
 COST_OF_INFLATION = 0.7  # log prior odds against each factor e of it
 # the pose is known to this much of the radius, turned and moved, before
 POSE_SIGMAS = (0.2, 0.1)
 OUTLIER = 5.0  # standard deviations of a patch that all the others predict
 MOST_OUTLIERS = 0.15  # of the patches
+# an outlier is as likely anywhere within so many mm, and before it is seen one patch in 50 is one
+OUTLIER_RANGE_MM, OUTLIER_SHARE = 4.0, 0.02
+DOUBTFUL_MM = 0.05  # a field that is smaller explains no patch on another face
+ROBUST_ITERATIONS, ROBUST_WIDTH = 20, 3.0  # in standard deviations
 
 
 class Field(NamedTuple):
@@ -141,8 +149,8 @@ class Average:
     """What all models together say.
 
     Attributes:
-      mean: [9] motion and terms, to be added to what they are.
-      covariance: [9, 9] of them.
+      mean: [9 + C] motion, terms and errors of calibration, to be added to what they are.
+      covariance: [9 + C, 9 + C] of them.
       term_probability: [3] that a term is there at all.
       field_probability: that there is a field.
       field: of the most probable model.
@@ -197,6 +205,14 @@ class Prior:
             return each - 0.5 * octaves**2
         return each
 
+    def log_share(self, field: Field, amplitude_mm: np.ndarray, stock_mm: float) -> np.ndarray:
+        """Log odds of an amplitude with stock: where there is much stock, it varies more."""
+        if field.kind not in ("form", "displacement") or abs(stock_mm) < LEAST_STOCK_MM:
+            return np.zeros_like(amplitude_mm)
+        step = np.log(AMPLITUDES[1] / AMPLITUDES[0])
+        even = np.log(len(AMPLITUDES) * step / (SHARE_SIGMA * np.sqrt(2 * np.pi)))
+        return even - 0.5 * (np.log(amplitude_mm / (SHARE * abs(stock_mm))) / SHARE_SIGMA) ** 2
+
     def models_of_terms(self) -> Iterator[tuple[int, ...]]:
         """Which terms may be together."""
         for terms in MODELS_OF_TERMS:
@@ -209,11 +225,21 @@ def average_models(patches: Patches, current: np.ndarray, prior: Prior) -> Avera
 
     Args:
       patches: under a pose and terms that are about right.
-      current: [3] the terms that are taken out of ``patches`` already.
+      current: [3 + C] the terms and errors that are taken out of ``patches`` already.
       prior: what is known.
     """
+    # a field that is large and short would explain patches that are on another face as well
     kept = np.ones(len(patches), bool)
-    average, standard = _average(patches, current, prior)
+    average, standard, evidence = _average(patches, current, prior)
+    doubtful = average.amplitude_mm > DOUBTFUL_MM or np.abs(standard).max() > OUTLIER
+    others = _on_most_faces(patches, current, prior) if doubtful else kept
+    if not others.all():
+        other = _average(patches.select(others), current, prior)
+        if (
+            other[2] + np.count_nonzero(~others) * np.log(OUTLIER_SHARE / OUTLIER_RANGE_MM)
+            > evidence
+        ):
+            kept, (average, standard, _) = others, other
     for _ in range(2):
         far = np.flatnonzero(kept)[np.abs(standard) > OUTLIER]
         order = np.argsort(-np.abs(standard[np.abs(standard) > OUTLIER]))
@@ -221,8 +247,35 @@ def average_models(patches: Patches, current: np.ndarray, prior: Prior) -> Avera
         if not len(far) or np.count_nonzero(~kept) + len(far) > MOST_OUTLIERS * len(kept):
             break
         kept[far] = False
-        average, standard = _average(patches.select(kept), current, prior)
+        average, standard, _ = _average(patches.select(kept), current, prior)
     return dataclasses.replace(average, outliers=~kept)
+
+
+def _on_most_faces(patches: Patches, current: np.ndarray, prior: Prior) -> np.ndarray:
+    """[M] bool: patches that parameters without a field explain, by a robust fit.
+
+    Geman-McClure, with a kernel that narrows to the noise or to what most patches are off by.
+    """
+    columns = patches.columns.copy()
+    columns[:, :3] /= prior.radius_mm
+    sigmas = np.ones(columns.shape[1])
+    sigmas[:6] = np.repeat(POSE_SIGMAS, 3) * prior.radius_mm
+    sigmas[6:9] = TERM_SIGMAS
+    parameters = -np.concatenate([np.zeros(6), current])
+    parameters[6:9] += _absent(prior)
+    if prior.stock_mm is not None:
+        sigmas[6] = 1e-9
+    known, middle = np.diag(sigmas**-2), sigmas**-2 * parameters
+    deviation = patches.deviation_mm
+    least = ROBUST_WIDTH * np.median(1 / np.sqrt(patches.weight))
+    width = ROBUST_WIDTH * robust_sigma(deviation, axis=0) + least
+    for _ in range(ROBUST_ITERATIONS):
+        off = deviation - columns @ parameters
+        width = max(min(0.8 * width, ROBUST_WIDTH * robust_sigma(off, axis=0)), least)
+        weight = 1 / (1 + (off / width) ** 2) ** 2 / width**2
+        information = columns.T @ (weight[:, None] * columns) + known
+        parameters = np.linalg.solve(information, columns.T @ (weight * deviation) + middle)
+    return np.abs(deviation - columns @ parameters) < 2 * width
 
 
 class _Models(NamedTuple):
@@ -238,15 +291,21 @@ class _Models(NamedTuple):
     inflation: np.ndarray  # [P]
 
 
-def _average(patches: Patches, current: np.ndarray, prior: Prior) -> tuple[Average, np.ndarray]:
-    """The average, and by how many standard deviations each patch is off all the others' word."""
+def _average(
+    patches: Patches, current: np.ndarray, prior: Prior
+) -> tuple[Average, np.ndarray, float]:
+    """The average, by how many standard deviations each patch is off all the others' word [M].
+
+    And the log of the probability density of the patches' deviations.
+    """
     unit = np.ones(patches.columns.shape[1])
     unit[:3] = 1 / prior.radius_mm  # rotations count as the way they move the outermost point
     scaled = dataclasses.replace(patches, columns=patches.columns * unit)
     models = list(_models(scaled, current, prior))
     top = max(float(m.log_probability.max()) for m in models)
     total = sum(float(np.exp(m.log_probability - top).sum()) for m in models)
-    mean, second = np.zeros(9), np.zeros((9, 9))
+    mean = np.zeros(len(unit))
+    second = np.diag(mean)
     term_probability, field_probability = np.zeros(3), 0.0
     for m in models:
         probability = np.exp(m.log_probability - top) / total
@@ -259,15 +318,16 @@ def _average(patches: Patches, current: np.ndarray, prior: Prior) -> tuple[Avera
     best = max(models, key=lambda m: m.log_probability.max())
     at = np.unravel_index(np.argmax(best.log_probability), best.log_probability.shape)
     average = Average(
-        mean=mean * unit[:9],
-        covariance=(second - np.outer(mean, mean)) * np.outer(unit[:9], unit[:9]),
+        mean=mean * unit,
+        covariance=(second - np.outer(mean, mean)) * np.outer(unit, unit),
         term_probability=term_probability,
         field_probability=float(field_probability),
         field=best.field,
         amplitude_mm=float(best.amplitude_mm[at]),
         outliers=np.zeros(len(patches), bool),
     )
-    return average, _standard_residuals(scaled, best, at, current, prior)
+    evidence = top + np.log(total) + 0.5 * np.log(patches.weight / (2 * np.pi)).sum()
+    return average, _standard_residuals(scaled, best, at, current, prior), float(evidence)
 
 
 def _models(patches: Patches, current: np.ndarray, prior: Prior) -> Iterator[_Models]:
@@ -294,7 +354,7 @@ def _models(patches: Patches, current: np.ndarray, prior: Prior) -> Iterator[_Mo
             # [deviations] = [columns, deviations] @ start, terms that are not there set right
             start = np.zeros(parameters + 1)
             start[-1] = 1
-            start[6:9] = current - _absent(prior)
+            start[6:9] = current[:3] - _absent(prior)
             start[[6 + k for k in terms]] = 0
             precision, middle = np.zeros(len(used)), np.zeros(len(used))
             precision[:3], precision[3:6] = 1 / POSE_SIGMAS[0] ** 2, 1 / POSE_SIGMAS[1] ** 2
@@ -302,7 +362,7 @@ def _models(patches: Patches, current: np.ndarray, prior: Prior) -> Iterator[_Mo
             inner = slice(6, 6 + len(terms))
             precision[inner] = 1 / TERM_SIGMAS[list(terms)] ** 2
             middle[inner] = -current[list(terms)]
-            precision[6 + len(terms) :] = 1
+            precision[6 + len(terms) :], middle[6 + len(terms) :] = 1, -current[3:]
             square = np.einsum("i,gpij,j->gp", start, products, start)
             gradient = np.einsum("gpij,j->gpi", products, start)[..., used] + precision * middle
             information = products[..., used, :][..., used] + np.diag(precision)
@@ -311,6 +371,7 @@ def _models(patches: Patches, current: np.ndarray, prior: Prior) -> Iterator[_Mo
             misfit = square + middle @ (precision * middle) - np.sum(gradient * mean, axis=-1)
             occam = np.linalg.slogdet(information)[1] - np.log(precision[inner]).sum()
             likelihood = -0.5 * (log_volume + occam + misfit)
+            likelihood += prior.log_share(field, amplitude, current[0] if 0 in terms else 0.0)
             yield _Models(
                 field,
                 terms,
@@ -331,13 +392,15 @@ def _absent(prior: Prior) -> np.ndarray:
 def _all_parameters(
     models: _Models, at: tuple[int, int], current: np.ndarray, prior: Prior
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[9] and [9, 9] of one model: terms that it does not have go to what they are without it."""
-    full, spread = np.zeros(9), np.zeros((9, 9))
-    full[6:9] = _absent(prior) - current
-    inside = models.parameters < 9
-    used = models.parameters[inside]
-    full[used] = models.mean[at][inside]
-    spread[np.ix_(used, used)] = models.covariance[at][np.ix_(inside, inside)]
+    """All parameters [D] of one model, and their covariance.
+
+    Terms that it does not have go to what they are without it.
+    """
+    full, used = np.zeros(6 + len(current)), models.parameters
+    spread = np.diag(full)
+    full[6:9] = _absent(prior) - current[:3]
+    full[used] = models.mean[at]
+    spread[np.ix_(used, used)] = models.covariance[at]
     return full, spread
 
 
@@ -345,9 +408,7 @@ def _standard_residuals(
     patches: Patches, best: _Models, at: tuple[int, int], current: np.ndarray, prior: Prior
 ) -> np.ndarray:
     """[M] how far each patch is from what all the others say, in standard deviations."""
-    full = np.zeros(patches.columns.shape[1])
-    full[6:9] = _absent(prior) - current
-    full[best.parameters] = best.mean[at]
+    full, _ = _all_parameters(best, at, current, prior)
     covariance = best.amplitude_mm[at] ** 2 * best.field.covariance(patches, prior)
     covariance += np.diag(best.inflation[at[1]] / patches.weight)
     inverse = np.linalg.inv(covariance)
