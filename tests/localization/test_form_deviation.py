@@ -24,12 +24,11 @@ from vanejax.cad.investment_casting import InvestmentCasting, as_cast
 from vanejax.cad.part import part_from_mesh
 from vanejax.errors import InputError
 from vanejax.localization.covariance import uncertainty
+from vanejax.localization.deviation_patches import as_designed, scaled_pose
 from vanejax.localization.fine_registration import refine
 from vanejax.localization.form_deviation import (
     CLEAR_MM,
-    as_designed,
     check_lengths,
-    scaled_pose,
     with_form_deviation,
 )
 from vanejax.localization.pose_batch import stack

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from vanejax.cad import part_from_mesh
-from vanejax.localization.form_deviation import scaled_pose
+from vanejax.localization.deviation_patches import scaled_pose
 from vanejax.localization.pose_result import FormDeviation, PointStatus, Verification
 from vanejax.plotting import deviation_map, overlay_before_after, residual_histogram
 from vanejax.plotting.canvas import FAR_ABOVE, NO_PARTNER

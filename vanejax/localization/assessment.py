@@ -11,8 +11,8 @@ import dataclasses
 import numpy as np
 
 from vanejax.localization.covariance import uncertainty
+from vanejax.localization.deviation_patches import as_designed, scaled_pose
 from vanejax.localization.fine_registration import robust_gauss_newton, subset
-from vanejax.localization.form_deviation import as_designed, scaled_pose
 from vanejax.localization.material import material_regions
 from vanejax.localization.pose_batch import concatenate, distances, distinct, is_same, select, stack
 from vanejax.localization.pose_result import (

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from vanejax.cad import Part
 from vanejax.localization import PoseResult, measurement_model
 from vanejax.localization.assessment import without_form_deviation
-from vanejax.localization.form_deviation import scaled_pose
+from vanejax.localization.deviation_patches import scaled_pose
 from vanejax.plotting.canvas import NO_PARTNER, SCAN
 from vanejax.plotting.deviation import (
     color_limit_mm,
