@@ -53,7 +53,8 @@ def test_stock_moves_the_part_unless_it_is_estimated() -> None:
 def test_the_largest_allowance_is_a_bound(most_mm: float) -> None:
     _, truth = stocked()
     result = found(most_mm)
-    assert 0 <= result.refinement.form.stock_mm <= most_mm
+    assert result.refinement.form.stock_mm == most_mm
+    assert ("stock 0.200 mm, its largest" in result.verdict.reason) == (most_mm == 0.2)
     # a smooth deviation takes up the rest of what is there all the same
     _, off_mm = pose_error(vane(), result.part_from_camera, truth)
     assert result.verdict.status != "accepted" or off_mm < 0.2

@@ -117,7 +117,8 @@ def in_words(form: FormDeviation | None) -> Iterator[str]:
     if form is None:
         return
     if form.stock_mm:
-        yield f"stock {form.stock_mm:.3f} +- {form.stock_sigma_mm:.3f} mm"
+        known = f"+- {form.stock_sigma_mm:.3f} mm" if form.stock_sigma_mm else "mm, its largest"
+        yield f"stock {form.stock_mm:.3f} {known}"
     if form.scale_error:
         word = "larger" if form.scale_error > 0 else "smaller"
         yield (
