@@ -189,6 +189,12 @@ def test_a_form_that_no_model_explains_is_ambiguous(form, words):
     assert words in found.reason
 
 
+@pytest.mark.parametrize("form", FORMS[3::2])
+def test_what_moves_the_pose_by_less_than_the_job_needs_is_no_doubt(form):
+    wide = Limits(tolerance_mm=5.0, tolerance_deg=5.0)
+    assert verdict(form=FormDeviation(**form), limits=wide).status == "accepted"
+
+
 def test_what_the_part_differs_by_is_named_with_its_figure():
     form = FormDeviation(stock_mm=0.5041, stock_sigma_mm=0.0012, field="form", field_mm=0.1)
     found = verdict(form=form)

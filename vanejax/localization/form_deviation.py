@@ -19,7 +19,7 @@ from vanejax.errors import InputError
 from vanejax.localization.deviation_patches import ScanDeviations, State, scaled_pose
 from vanejax.localization.fine_registration import robust_gauss_newton, subset
 from vanejax.localization.pose_batch import select, stack
-from vanejax.localization.pose_result import FormDeviation, Refinement
+from vanejax.localization.pose_result import BEYOND_EDGES_MM, FormDeviation, Refinement
 from vanejax.localization.random_fields import Average, Prior, average_models
 from vanejax.localization.residuals import MeasurementModel, RayCasting, moved
 from vanejax.localization.sensor_calibration import Calibration
@@ -39,7 +39,6 @@ LIKELY = 0.5  # a term more probable than this is taken to be there
 # how many times more than elsewhere all points may know in a direction than those on smooth faces:
 # what is beyond comes from edges, and of a casting they are that far off
 MOST_BY_EDGES, EDGE_MM = 30.0, 0.4
-BEYOND_MM = 3.0
 # of the stock: how well the points under it are known where the surface is curved
 STOCK_TRUENESS = 0.005
 # of the field: it is taken to be small, and moves where a ray ends
@@ -188,7 +187,7 @@ def _as_designed_already(scan: ScanDeviations, state: State, prior: Prior) -> Av
 def _beyond_edges(scan: ScanDeviations, state: State, noise_mm: float, count: int) -> float:
     """Share of the points beside the part, by more than their spacing and noise let them be.
 
-    By no more than `BEYOND_MM` either: what is farther off is clutter. ``count`` is of the
+    By no more than `BEYOND_EDGES_MM` either: what is farther off is clutter. ``count`` is of the
     whole scan. Stock on one side shows here, where all that is seen of the faces looks moved.
     """
     model, points = scan.as_designed(state)
@@ -196,7 +195,7 @@ def _beyond_edges(scan: ScanDeviations, state: State, noise_mm: float, count: in
     near = cKDTree(points).query(points[::10], k=2)[0][:, 1]
     spacing_mm = np.median(near) * np.sqrt(len(points) / count)
     off_mm = residuals.deviation_mm[0][~residuals.hit[0]]
-    beyond = (off_mm > max(spacing_mm / 2, 5 * noise_mm)) & (off_mm < BEYOND_MM)
+    beyond = (off_mm > max(spacing_mm / 2, 5 * noise_mm)) & (off_mm < BEYOND_EDGES_MM)
     return float(np.count_nonzero(beyond) / len(points))
 
 

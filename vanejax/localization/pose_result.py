@@ -16,6 +16,7 @@ import numpy as np
 from vanejax.rigid import RigidTransform
 
 BOUND = 1.96  # standard deviations: 95 %
+BEYOND_EDGES_MM = 3.0  # off the part by more is clutter
 Status = Literal["accepted", "ambiguous", "rejected"]
 FieldKind = Literal["none", "form", "displacement", "range", "facing"]
 
@@ -92,7 +93,8 @@ class FormDeviation:
       field_mm: its standard deviation.
       field_length_mm: over which it is smooth.
       unexplained_share: of the patches of the scan, those that nothing explains.
-      beyond_edges_share: of the points, those that lie clearly beyond the part's edges, a little.
+      beyond_edges_share: of the points, those that lie clearly beyond the part's edges, by no more
+        than `BEYOND_EDGES_MM`.
       converged: whether the estimate stayed the same in the end.
       is_told: whether there was enough smooth surface to tell.
     """

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from vanejax.localization.pose_result import (
+    BEYOND_EDGES_MM,
     FormDeviation,
     MaterialRegion,
     Uncertainty,
@@ -40,9 +41,11 @@ class Limits:
       tolerance_deg, tolerance_mm: what the job needs: the 95 % bounds of the pose, in its
         weakest directions, are to be within.
       most_scale_error: of a scan against the CAD model; above it the part is another one.
-      most_field_mm: standard deviation of a smooth deviation of form; above it no pose is certain,
-        since a deviation that large is seldom random: it is stock on one side, or a bend.
-      most_beyond_edges_share: of the points, those that lie beyond the part's edges.
+      most_field_mm: standard deviation of a smooth deviation of form; above it, and a quarter of
+        ``tolerance_mm``, no pose is certain, since a deviation that large is seldom random: it is
+        stock on one side, or a bend.
+      most_beyond_edges_share: of the points, those that lie beyond the part's edges; of no matter
+        where ``tolerance_mm`` is as large as they may be off.
       most_unexplained_share: of the scan's patches, those that no model of its form explains.
     """
 
@@ -264,7 +267,8 @@ def _doubts_of_form(form: FormDeviation | None, limits: Limits) -> Iterator[str]
         )
     # stock and size move all edges, as they should
     moved = form.stock_mm or form.scale_error
-    if form.beyond_edges_share > limits.most_beyond_edges_share and not moved:
+    tight = limits.tolerance_mm < BEYOND_EDGES_MM
+    if form.beyond_edges_share > limits.most_beyond_edges_share and tight and not moved:
         yield (
             f"{form.beyond_edges_share:.1%} of the points lie beyond the part's edges: it may have "
             "stock on one side, which moves the pose by as much, or something touches it"
@@ -274,7 +278,7 @@ def _doubts_of_form(form: FormDeviation | None, limits: Limits) -> Iterator[str]
             f"faces that look in different directions are offset by some {form.field_mm:.2g} mm, "
             "as by stock on a few faces only: the pose may be off by as much"
         )
-    elif form.field_mm > limits.most_field_mm:
+    elif form.field_mm > max(limits.most_field_mm, limits.tolerance_mm / 4):
         yield (
             f"the part differs from its CAD model by {form.field_mm:.2g} mm: so much is seldom "
             "random, and the pose may be off by as much"
