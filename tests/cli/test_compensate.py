@@ -17,7 +17,7 @@ from example_result import example_result, pose
 
 from vanejax.cad.part import Part, part_from_mesh
 from vanejax.cli.program import main
-from vanejax.localization.pose_result import BOUND, FormDeviation
+from vanejax.localization.pose_result import FormDeviation, magnitude_bound
 from vanejax.machine.frame_notation import NOTATIONS, read_kuka, write_kuka
 from vanejax.machine.pose_file import write_result
 from vanejax.machine.tool_path import ToolPath, read_tool_path, write_tool_path
@@ -222,7 +222,8 @@ def test_without_a_camera_sigma_the_pose_alone_counts(files: Path, capsys) -> No
     assert main(["compensate", *CELL, *PATH, "--part", "box.stl"]) == 0
     out = capsys.readouterr().out
     # of the example the largest sigma is 0.006 mm; 0.003 deg at 36 mm are a third of that
-    assert known_mm(out, "centre") == pytest.approx(BOUND * 0.006, abs=5e-4)
+    centre = float(magnitude_bound(np.diag([4e-3, 5e-3, 6e-3]) ** 2))
+    assert known_mm(out, "centre") == pytest.approx(centre, abs=5e-4)
     assert 0.012 <= known_mm(out, "tool tip") <= known_mm(out, "surface") < 0.02
     assert "by the camera's place" not in out
     assert "\n  the camera's place in the machine is taken as exact (no --camera-sigma)\n" in out
@@ -235,7 +236,8 @@ def test_the_cameras_place_counts_by_its_distance(files: Path, capsys) -> None:
     out = capsys.readouterr().out
     points = read_tool_path("moved.csv").points
     arms = np.linalg.norm(points - MACHINE_FROM_CAMERA.translation, axis=1)
-    expected = BOUND * np.hypot(0.02, np.radians(0.01) * arms)
+    sigma = np.stack([np.full_like(arms, 0.02), *[np.hypot(0.02, np.radians(0.01) * arms)] * 2])
+    expected = magnitude_bound(sigma.T[:, :, None] ** 2 * np.eye(3))
     worst = int(expected.argmax())
     assert known_mm(out, "tool tip") == pytest.approx(expected[worst], abs=2e-3)  # 0.012 the pose
     place = ", ".join(f"{v:.1f}" for v in points[worst])
@@ -270,7 +272,7 @@ def test_the_verdicts_tolerance_is_kept(files: Path, capsys) -> None:
     Path("strict.json").write_text(json.dumps(values | {"tolerance": {"mm": 0.01, "deg": 0.5}}))
     command = ["compensate", "strict.json", "--format", "kuka"]
     assert main(command) == 3
-    assert "the part's centre is known to 0.012 mm only (95 %), and" in capsys.readouterr().err
+    assert "the part's centre is known to 0.014 mm only (95 %), and" in capsys.readouterr().err
     assert main([*command, "--max-uncertainty-mm", "0.02"]) == 0
 
 

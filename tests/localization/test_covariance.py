@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from example_result import example_result
 from example_scans import ideal_scan, model, vane
+from scipy.spatial.transform import Rotation
 
 from vanejax.localization.covariance import PATCHES, inflation, uncertainty
-from vanejax.localization.pose_result import Refinement
+from vanejax.localization.pose_result import Refinement, magnitude_bound
 from vanejax.localization.residuals import SurfaceMatching
 from vanejax.localization.scan_patches import patch_labels
 
@@ -101,3 +102,14 @@ def test_few_patches_say_nothing():
     assert few[0].max() < 19
     assert inflation(values.T @ values, values, few) == 1.0
     assert inflation(np.zeros((6, 6)), values, patches) == 1.0
+
+
+@pytest.mark.parametrize("sigmas", [[1.0, 1, 1], [1, 0, 0], [1, 1, 0], [1, 0.7, 0.3], [3, 1, 1]])
+def test_a_magnitude_is_within_its_bound_as_often_as_it_says(sigmas) -> None:
+    turn = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
+    covariance = turn @ np.diag(np.square(sigmas)) @ turn.T
+    errors = np.random.default_rng(1).normal(size=(200_000, 3)) * sigmas
+    within = np.linalg.norm(errors, axis=1) <= magnitude_bound(covariance)
+    assert np.mean(within) == pytest.approx(0.95, abs=0.004)
+    stacked = magnitude_bound(np.stack([covariance, 4 * covariance, np.zeros((3, 3))]))
+    np.testing.assert_allclose(stacked, stacked[0] * np.array([1, 2, 0]), rtol=1e-12)

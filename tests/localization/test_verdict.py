@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from example_result import example_result, pose
+from scipy.linalg import block_diag
 
 from vanejax.localization.pose_result import BOUND, FormDeviation, MaterialRegion, Verdict
 from vanejax.localization.verdict import CompetingHypothesis, Limits, judge
@@ -149,19 +150,18 @@ def test_a_fault_outweighs_a_other():
 )
 def test_a_weak_direction_is_ambiguous_and_named(axis, words):
     limits = Limits()
-    turn = {"weakest_rotation_axis": np.array(axis), "weakest_rotation_sigma_deg": 2.5}
+    along = block_diag(*[np.outer(axis, axis)] * 2)
+    turn = {"weakest_rotation_axis": np.array(axis), "covariance": np.radians(2.5) ** 2 * along}
     found = verdict(uncertainty=turn)
     assert found.status == "ambiguous"
-    assert f"about {words} is known to 4.9 deg only (95 %)" in found.reason
-    shift = {"weakest_translation_axis": np.array(axis), "weakest_translation_sigma_mm": 1.25}
-    found = verdict(uncertainty=shift)
+    assert f"is known to 4.9 deg only (95 %), least about {words}" in found.reason
+    shift = np.diag([0, 0, 0, 1, 1, 1]) @ (1.25**2 * along)
+    found = verdict(uncertainty={"weakest_translation_axis": np.array(axis), "covariance": shift})
     assert found.status == "ambiguous"
-    assert f"along {words} is known to 2.5 mm only (95 %)" in found.reason
-    close = {
-        "weakest_rotation_sigma_deg": 0.99 * limits.tolerance_deg / BOUND,
-        "weakest_translation_sigma_mm": 0.99 * limits.tolerance_mm / BOUND,
-    }
-    assert verdict(uncertainty=close).status == "accepted"
+    assert f"is known to 2.4 mm only (95 %), least along {words}" in found.reason
+    needed = np.repeat([np.radians(limits.tolerance_deg), limits.tolerance_mm], 3) / BOUND
+    close = along * np.outer(0.99 * needed, 0.99 * needed)
+    assert verdict(uncertainty={"covariance": close}).status == "accepted"
 
 
 FORMS = [
@@ -202,7 +202,7 @@ def test_what_the_part_differs_by_is_named_with_its_figure():
     assert "stock 0.504 +- 0.001 mm" in found.reason
     assert "the surface varies by 0.1 mm" in found.reason
     form = FormDeviation(scale_error=-0.0101, scale_sigma=0.0001, focal_error=0.003)
-    found = verdict(form=form, uncertainty={"weakest_translation_sigma_mm": 2.0})
+    found = verdict(form=form, uncertainty={"covariance": np.diag([0, 0, 0, 4.0, 0, 0])})
     assert found.status == "ambiguous"
     assert "1.010% +- 0.010% smaller than the CAD model" in found.reason
     assert "focal length is off by +0.300%" in found.reason

@@ -12,10 +12,12 @@ from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from vanejax.rigid import RigidTransform
 
-BOUND = 1.96  # standard deviations: 95 %
+SURE = 0.95  # of the errors are within a bound
+BOUND = 1.96  # standard deviations: the same along one axis
 BEYOND_EDGES_MM = 3.0  # off the part by more is clutter
 Status = Literal["accepted", "ambiguous", "rejected"]
 FieldKind = Literal["none", "form", "displacement", "range", "facing"]
@@ -66,13 +68,33 @@ class Uncertainty:
 
     @property
     def rotation_bound_deg(self) -> float:
-        """What the error about the weakest axis exceeds in 5 of 100 cases."""
-        return BOUND * self.weakest_rotation_sigma_deg
+        """What the angle of the error exceeds in 5 of 100 cases."""
+        return float(np.degrees(magnitude_bound(self.covariance[:3, :3])))
 
     @property
     def translation_bound_mm(self) -> float:
-        """What the error in the weakest direction exceeds in 5 of 100 cases."""
-        return BOUND * self.weakest_translation_sigma_mm
+        """What the length of the error, at the part's centre, exceeds in 5 of 100 cases."""
+        return float(magnitude_bound(self.covariance[3:, 3:]))
+
+
+def magnitude_bound(covariance: np.ndarray) -> np.ndarray:
+    """What the length of a Gaussian error [..., 3] exceeds in 5 of 100 cases.
+
+    By the chi-square distribution with the same first three moments of the squared length, which
+    is exact where the axes are equal or one is alone. Source: Imhof, Biometrika 48, 1961.
+
+    Args:
+      covariance: [..., 3, 3]; the result is in the unit of its square root.
+    """
+    second = covariance @ covariance
+    first, second, third = (
+        np.trace(power, axis1=-2, axis2=-1) for power in (covariance, second, second @ covariance)
+    )
+    some = third > 0
+    degrees = np.where(some, second, 1) ** 3 / np.where(some, third, 1) ** 2
+    quantile = 2 * gammaincinv(degrees / 2, SURE)
+    squared = first + (quantile - degrees) * np.sqrt(np.where(some, second, 0) / degrees)
+    return np.sqrt(np.maximum(squared, 0))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -38,8 +38,8 @@ class Limits:
       least_inliers: points.
       least_preference: how many standard errors the patches of the scan must prefer the pose to
         each other pose that was tried.
-      tolerance_deg, tolerance_mm: what the job needs: the 95 % bounds of the pose, in its
-        weakest directions, are to be within.
+      tolerance_deg, tolerance_mm: what the job needs: the 95 % bounds of the pose are to be
+        within.
       most_scale_error: of a scan against the CAD model; above it the part is another one.
       most_field_mm: standard deviation of a smooth deviation of form; above it, and a quarter of
         ``tolerance_mm``, no pose is certain, since a deviation that large is seldom random: it is
@@ -305,13 +305,15 @@ def _doubts_of_bounds(
     deg, mm = uncertainty.rotation_bound_deg, uncertainty.translation_bound_mm
     if deg > limits.tolerance_deg:
         yield (
-            f"the rotation about {_axis(uncertainty.weakest_rotation_axis)} is known to {deg:.2g} "
-            f"deg only (95 %), and the job needs {limits.tolerance_deg:g} deg: {help_}"
+            f"the rotation is known to {deg:.2g} deg only (95 %), least about "
+            f"{_axis(uncertainty.weakest_rotation_axis)}, and the job needs "
+            f"{limits.tolerance_deg:g} deg: {help_}"
         )
     if mm > limits.tolerance_mm:
         yield (
-            f"the position along {_axis(uncertainty.weakest_translation_axis)} is known to "
-            f"{mm:.2g} mm only (95 %), and the job needs {limits.tolerance_mm:g} mm: {help_}"
+            f"the position is known to {mm:.2g} mm only (95 %), least along "
+            f"{_axis(uncertainty.weakest_translation_axis)}, and the job needs "
+            f"{limits.tolerance_mm:g} mm: {help_}"
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from vanejax.errors import InputError
-from vanejax.localization.pose_result import BOUND
+from vanejax.localization.pose_result import magnitude_bound
 from vanejax.machine.positioning import recentred
 from vanejax.rigid import RigidTransform
 
@@ -62,22 +62,20 @@ class MotionCovariance:
     def bounds_mm(self, points: np.ndarray) -> np.ndarray:
         """[N]: what the error of each of the points [N, 3] mm exceeds in 5 of 100 cases.
 
-        In the direction in which that point is known least.
-
         Raises:
           InputError: a point that is more than `FARTHEST_MM` away.
         """
         _check_near(points)
         arms = np.asarray(points, np.float64) - self.center
         blocks = np.array_split(arms, len(arms) // BLOCK + 1)
-        return BOUND * np.sqrt(np.concatenate([self._largest_variance(b) for b in blocks]))
+        return np.concatenate([magnitude_bound(self._at(block)) for block in blocks])
 
-    def _largest_variance(self, arms: np.ndarray) -> np.ndarray:
+    def _at(self, arms: np.ndarray) -> np.ndarray:
+        """[n, 3, 3] mm^2, of points by their arms [n, 3] mm."""
         ways = np.zeros((len(arms), 3, 6))  # of a rotation vector w and a shift v: w x arm + v
         ways[:, :, :3] = np.cross(np.eye(3), arms[:, None, :]).swapaxes(1, 2)
         ways[:, :, 3:] = np.eye(3)
-        variance = np.linalg.eigvalsh(ways @ self.covariance @ ways.swapaxes(1, 2))[:, -1]
-        return np.maximum(variance, 0)
+        return ways @ self.covariance @ ways.swapaxes(1, 2)
 
 
 def _check_near(points: np.ndarray) -> None:

@@ -13,7 +13,6 @@ from experiments.runner.markdown import table as markdown_table
 from experiments.runner.required_accuracy import NEED_DEG, NEED_MM, within_need
 from experiments.studies.castings.casting_line import KINDS
 from experiments.studies.verdicts.report import STATUSES
-from vanejax.localization.pose_result import BOUND
 from vanejax.plotting.canvas import (
     FAINT,
     INK,
@@ -35,7 +34,6 @@ RARE = 0.0027
 MOST_SQUARED = float(chi2.ppf(1 - RARE, 6))
 STAGES = {"before": "fine registration alone, from the truth", "after": "register"}
 FIGURES = ("rotation_deg", "translation_mm", "squared", "covered")
-WITHIN = ("rotation_within_bound", "translation_within_bound")
 
 
 def is_wrong(row: Report) -> bool:
@@ -52,7 +50,7 @@ def is_wrong(row: Report) -> bool:
 
 def is_beyond(row: Report) -> bool:
     """Whether a magnitude exceeds `MOST_SIGMAS` standard deviations in the weakest direction."""
-    return BOUND * max(_over_bounds(row)) > MOST_SIGMAS
+    return row["after"]["over_sigma"] > MOST_SIGMAS
 
 
 def _over_bounds(row: Report) -> tuple[float, float]:
@@ -110,22 +108,11 @@ def _summary(rows: Sequence[Report]) -> dict[str, Any]:
         "within_bounds_accepted": [
             _of(np.mean, [_over_bounds(row)[which] <= 1 for row in placed]) for which in (0, 1)
         ],
-        "by_chance_accepted": _by_chance([row["after"].get("by_chance") for row in placed]),
+        "beyond_by_chance": sum(row["after"]["beyond_by_chance"] for row in placed),
         "times_cramer_rao": {"median": _of(np.median, ratios), "rms": _of(_rms, ratios)},
         "seconds": _of(np.median, [row["seconds"] for row in rows]),
         "cpu_seconds": _of(np.median, cpu_seconds),
     }
-
-
-def _by_chance(chances: Sequence[Report | None]) -> dict[str, float]:
-    """Of Gaussian errors: how many exceed `MOST_SIGMAS`, and how often the bounds hold.
-
-    NaN where a record does not say it of every pose.
-    """
-    if not chances or None in chances:
-        return dict.fromkeys(("beyond", *WITHIN), float("nan"))
-    means = {name: _of(np.mean, [each[name] for each in chances]) for name in WITHIN}
-    return {"beyond": float(sum(each["beyond"] for each in chances)), **means}
 
 
 def _rms(values: Sequence[float]) -> float:
@@ -143,7 +130,7 @@ def _lines(summaries: Report) -> Iterable[list[str]]:
     kinds = {KINDS[kind].title: summary for kind, summary in summaries["kinds"].items()}
     for title, summary in {**kinds, "all": summaries["all"]}.items():
         before, after = summary["before"], summary["after"]
-        chance = _digits("{:.2g}", summary["by_chance_accepted"]["beyond"])
+        chance = _digits("{:.2g}", summary["beyond_by_chance"])
         yield [
             title,
             *(str(summary[name]) for name in ("cases", *STATUSES, "accepted_wrong")),
@@ -202,13 +189,11 @@ LEGEND = (
 def _remarks(summaries: Report) -> Iterable[str]:
     """Lines of a list below the table."""
     kinds = summaries["kinds"]
-    chance = summaries["all"]["by_chance_accepted"]
-    held, expected = summaries["all"]["within_bounds_accepted"], [chance[name] for name in WITHIN]
-    if np.isfinite([*held, *expected]).all():
+    held = summaries["all"]["within_bounds_accepted"]
+    if np.isfinite(held).all():
         yield (
             f"- bounds of rotation and translation hold for {held[0]:.1%} and {held[1]:.1%} of "
-            f"the accepted poses; Gaussian errors with their covariances: {expected[0]:.1%} and "
-            f"{expected[1]:.1%}"
+            "the accepted poses"
         )
     if "equal" in kinds and np.isfinite(kinds["equal"]["times_cramer_rao"]["rms"]):
         ratio = kinds["equal"]["times_cramer_rao"]

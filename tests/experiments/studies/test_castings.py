@@ -22,7 +22,7 @@ from experiments.studies.castings.casting_line import (
 from experiments.studies.castings.report import HEAD, is_wrong, summarize, table
 from experiments.studies.castings.study import (
     accuracy,
-    by_chance,
+    beyond_by_chance,
     case_names,
     is_a_pitch_off,
     kept_rows,
@@ -33,7 +33,7 @@ from experiments.studies.castings.study import (
 )
 from vanejax.errors import InputError
 from vanejax.localization.pose_batch import stack
-from vanejax.localization.pose_result import BOUND, Uncertainty
+from vanejax.localization.pose_result import Uncertainty
 from vanejax.localization.residuals import measurement_model
 from vanejax.rigid import RigidTransform
 
@@ -128,18 +128,17 @@ def test_an_error_is_compared_with_its_covariance() -> None:
     found = accuracy(SIGMA * [1, -1, 0, 1, 1, 3], stated_by(SIGMA))
     assert found["squared"] == pytest.approx(13 / 6)
     assert found["covered"] == pytest.approx(5 / 6)
-    assert found["rotation_over_bound"] == pytest.approx(np.sqrt(2) / BOUND)
+    assert found["rotation_over_bound"] == pytest.approx(np.sqrt(2 / chi2.ppf(0.95, 3)))
+    assert found["over_sigma"] == pytest.approx(np.sqrt(11))
     assert found["translation_mm"] == pytest.approx(0.2 * np.sqrt(11))
 
 
 def test_what_chance_does_to_magnitudes() -> None:
-    found = by_chance(stated_by(SIGMA))
-    within = chi2.cdf(BOUND**2, 3)  # three axes that are known equally well
-    assert found["rotation_within_bound"] == pytest.approx(within, abs=0.005)
-    assert found["beyond"] == pytest.approx(1 - chi2.cdf(9, 3) ** 2, abs=0.003)
-    found = by_chance(stated_by(SIGMA * [1, 1, 1, 1, 1e-3, 1e-3]))  # one axis matters
-    assert found["translation_within_bound"] == pytest.approx(0.95, abs=0.005)
-    assert found == by_chance(stated_by(SIGMA * [1, 1, 1, 1, 1e-3, 1e-3]))
+    found = beyond_by_chance(stated_by(SIGMA))  # three axes that are known equally well
+    assert found == pytest.approx(1 - chi2.cdf(9, 3) ** 2, abs=0.003)
+    one_axis = stated_by(SIGMA * [1, 1e-3, 1e-3, 1, 1e-3, 1e-3])
+    assert beyond_by_chance(one_axis) == pytest.approx(2 * 0.0027, abs=0.001)
+    assert beyond_by_chance(one_axis) == beyond_by_chance(one_axis)
 
 
 def test_an_error_is_compared_with_the_least_possible() -> None:
@@ -167,7 +166,8 @@ def row(
 ) -> dict:
     after = {
         "rotation_deg": deg, "translation_mm": mm, "squared": squared, "covered": 1.0,
-        "rotation_over_bound": 0.1, "translation_over_bound": over,
+        "rotation_over_bound": 0.1, "translation_over_bound": over, "over_sigma": 2 * over,
+        "beyond_by_chance": 0.01,
     }  # fmt: skip
     if kind == "other_part":
         after = None
@@ -201,14 +201,12 @@ def test_what_is_counted() -> None:
 
 
 def test_three_sigma_are_counted_beside_what_chance_gives() -> None:
-    rows = [row("equal", "accepted", over=over / BOUND) for over in (0.1, 1.97, 3.1)]
+    rows = [row("equal", "accepted", over=over) for over in (0.1, 1.01, 1.6)]
     summary = summarize(rows)["all"]
     assert (summary["accepted_wrong"], summary["accepted_beyond"]) == (0, 1)
     assert summary["within_bounds_accepted"] == pytest.approx([1, 1 / 3])
-    assert "| 1 |" in table({"rows": rows})  # a record may not say what chance gives
-    chances = {"beyond": 0.01, "rotation_within_bound": 0.9, "translation_within_bound": 0.8}
     for each, ratio in zip(rows, (0.8, 1.0, 2.0), strict=True):
-        each["after"] |= {"by_chance": chances, "times_cramer_rao": ratio}
+        each["after"] |= {"times_cramer_rao": ratio}
     text = table({"rows": rows})
     assert "| 1 (0.03) |" in text
     assert "100.0% and 33.3% of the accepted poses" in text
