@@ -22,26 +22,30 @@ def verdict_line(verdict: Verdict, *, color: bool) -> str:
     return f"{word}: {verdict.reason}"
 
 
-def summary(result: PoseResult, *, color: bool, seconds: Mapping[str, float]) -> str:
+def summary(
+    result: PoseResult, *, color: bool, seconds: Mapping[str, float], calibrated: bool = False
+) -> str:
     """A compact page of text, the verdict first.
 
     Args:
       result: what to show.
       color: whether the terminal takes colours.
       seconds: of each stage, in order; the whole last.
+      calibrated: whether sigma has what the camera's calibration leaves open.
     """
     from vanejax.machine.pose_file import pose_to_dict
 
     numbers = pose_to_dict(result.part_from_camera)["part_from_camera_as"]
     uncertainty, checks, refinement = result.uncertainty, result.verification, result.refinement
     ended = "converged" if refinement.converged else "NOT CONVERGED"
+    lacking = "" if calibrated else "; without the camera's calibration"
     lines = [
         verdict_line(result.verdict, color=color),
         "",
         "part_from_camera (from the scan's frame to the CAD model's)",
         f"  translation  {_row(numbers['translation_mm'])} mm",
         f"  Euler XYZ    {_row(numbers['euler_xyz_deg'])} deg (fixed axes x, y, z)",
-        "sigma (of the part about its centre, along its x, y, z)",
+        f"sigma (of the part about its centre, along its x, y, z{lacking})",
         f"  translation  {_row(uncertainty.translation_sigma_mm)} mm, at most "
         f"{_number(uncertainty.weakest_translation_sigma_mm)} along "
         f"{_direction(uncertainty.weakest_translation_axis)}",

@@ -155,7 +155,9 @@ def run(arguments: argparse.Namespace) -> int:
         print(verdict_line(result.verdict, color=color))
     else:
         seconds = {"start and files": prepared - started, **result.seconds}
-        print(summary(result, color=color, seconds=seconds | {"total": ended - started}))
+        seconds["total"] = ended - started
+        calibrated = calibration is not None
+        print(summary(result, color=color, seconds=seconds, calibrated=calibrated))
     sys.stdout.flush()
     if arguments.json is not None:
         write_result(

@@ -17,6 +17,7 @@ from vanejax.localization.pose_result import (
 from vanejax.rigid import RigidTransform
 
 MOST_OF_THEM = 0.9  # of the points: so many are not few
+ROUGH = 0.25  # of the part's radius: a distortion, or a sensor's error, is smoother
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +45,8 @@ class Limits:
       most_field_mm: standard deviation of a smooth deviation of form; above it, and a quarter of
         ``tolerance_mm``, no pose is certain, since a deviation that large is seldom random: it is
         stock on one side, or a bend.
+      most_rough_mm: likewise, of a distortion or a sensor's error that changes within a few
+        millimetres (`ROUGH` of the part's radius), which neither does; it is false stock.
       most_beyond_edges_share: of the points, those that lie beyond the part's edges; of no matter
         where ``tolerance_mm`` is as large as they may be off.
       most_unexplained_share: of the scan's patches, those that no model of its form explains.
@@ -61,6 +64,7 @@ class Limits:
     tolerance_mm: float = 1.0
     most_scale_error: float = 0.035
     most_field_mm: float = 0.25
+    most_rough_mm: float = 0.04
     most_beyond_edges_share: float = 0.003
     most_unexplained_share: float = 0.05
 
@@ -103,7 +107,7 @@ def judge(
     differences = "".join(f"; {words}" for words in in_words(form)) + material
     for reasons in (
         _doubts(verification, competing, radius_mm, limits),
-        _doubts_of_form(form, limits),
+        _doubts_of_form(form, radius_mm, limits),
         _doubts_of_bounds(uncertainty, form, limits),
     ):
         for reason in reasons:
@@ -252,7 +256,7 @@ def _weak_support(verification: Verification) -> str:
     )
 
 
-def _doubts_of_form(form: FormDeviation | None, limits: Limits) -> Iterator[str]:
+def _doubts_of_form(form: FormDeviation | None, radius_mm: float, limits: Limits) -> Iterator[str]:
     """Why what the part differs by leaves the pose open."""
     if form is None:
         return
@@ -282,6 +286,12 @@ def _doubts_of_form(form: FormDeviation | None, limits: Limits) -> Iterator[str]
         yield (
             f"the part differs from its CAD model by {form.field_mm:.2g} mm: so much is seldom "
             "random, and the pose may be off by as much"
+        )
+    rough = form.field in ("displacement", "range") and form.field_length_mm < ROUGH * radius_mm
+    if rough and form.field_mm > limits.most_rough_mm:
+        yield (
+            f"deviations change by {form.field_mm:.2g} mm within {form.field_length_mm:.0f} mm, as "
+            "by stock on one side only: the pose may be off by as much stock as there is"
         )
     if not form.converged:
         yield (
