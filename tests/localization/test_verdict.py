@@ -177,7 +177,7 @@ WORDS = [
     "too little smooth surface was measured",
     "did not converge",
     "8% of the surface is not where the CAD model has it",
-    "1.2% of the points lie beyond the part's edges",
+    "1.20% of the points lie beyond the part's edges",
     "offset by some 0.12 mm",
     "differs from its CAD model by 0.31 mm",
     "deviations change by 0.09 mm within",

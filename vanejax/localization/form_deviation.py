@@ -39,6 +39,7 @@ LIKELY = 0.5  # a term more probable than this is taken to be there
 # how many times more than elsewhere all points may know in a direction than those on smooth faces:
 # what is beyond comes from edges, and of a casting they are that far off
 MOST_BY_EDGES, EDGE_MM = 30.0, 0.4
+AT_CORNERS = 1.5  # times as far as a face, an edge of two of them is moved
 # of the stock: how well the points under it are known where the surface is curved
 STOCK_TRUENESS = 0.005
 # of the field: it is taken to be small, and moves where a ray ends
@@ -119,7 +120,7 @@ def with_form_deviation(
     result = _result(
         model, refinement, *estimate, stock_mm=prior.stock_mm, calibrated=calibration is not None
     )
-    beyond = _beyond_edges(scan, estimate[0], refinement.noise_mm, len(points))
+    beyond = _beyond_edges(scan, estimate[0], result, len(points))
     return dataclasses.replace(
         result, form=dataclasses.replace(result.form, beyond_edges_share=beyond)
     )
@@ -184,18 +185,21 @@ def _as_designed_already(scan: ScanDeviations, state: State, prior: Prior) -> Av
     return None if some or _squared(average) > BY_CHANCE else average
 
 
-def _beyond_edges(scan: ScanDeviations, state: State, noise_mm: float, count: int) -> float:
-    """Share of the points beside the part, by more than their spacing and noise let them be.
+def _beyond_edges(scan: ScanDeviations, state: State, result: Refinement, count: int) -> float:
+    """Share of the points beside the part, by more than spacing, noise and form let them be.
 
     By no more than `BEYOND_EDGES_MM` either: what is farther off is clutter. ``count`` is of the
     whole scan. Stock on one side shows here, where all that is seen of the faces looks moved.
     """
+    form = result.form
     model, points = scan.as_designed(state)
     residuals = model.residuals(stack(state.pose), points)
     near = cKDTree(points).query(points[::10], k=2)[0][:, 1]
     spacing_mm = np.median(near) * np.sqrt(len(points) / count)
     off_mm = residuals.deviation_mm[0][~residuals.hit[0]]
-    beyond = (off_mm > max(spacing_mm / 2, 5 * noise_mm)) & (off_mm < BEYOND_EDGES_MM)
+    least_mm = max(spacing_mm / 2, 5 * result.noise_mm)
+    least_mm += AT_CORNERS * (abs(form.stock_mm) + 2 * form.field_mm)
+    beyond = (off_mm > least_mm) & (off_mm < BEYOND_EDGES_MM)
     return float(np.count_nonzero(beyond) / len(points))
 
 

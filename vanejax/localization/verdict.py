@@ -47,8 +47,9 @@ class Limits:
         stock on one side, or a bend.
       most_rough_mm: likewise, of a distortion or a sensor's error that changes within a few
         millimetres (`ROUGH` of the part's radius), which neither does; it is false stock.
-      most_beyond_edges_share: of the points, those that lie beyond the part's edges; of no matter
-        where ``tolerance_mm`` is as large as they may be off.
+      most_beyond_edges_share: of the points, those that lie beyond the part's edges; three times as
+        many with stock, where edges are less sharp; of no matter where ``tolerance_mm`` is as large
+        as they may be off.
       most_unexplained_share: of the scan's patches, those that no model of its form explains.
     """
 
@@ -65,7 +66,7 @@ class Limits:
     most_scale_error: float = 0.035
     most_field_mm: float = 0.25
     most_rough_mm: float = 0.04
-    most_beyond_edges_share: float = 0.003
+    most_beyond_edges_share: float = 0.001
     most_unexplained_share: float = 0.05
 
 
@@ -269,12 +270,12 @@ def _doubts_of_form(form: FormDeviation | None, radius_mm: float, limits: Limits
             f"{form.unexplained_share:.0%} of the surface is not where the CAD model has it, and "
             "no smooth deviation explains that: missing or extra material, or another part"
         )
-    # stock and size move all edges, as they should
-    moved = form.stock_mm or form.scale_error
-    tight = limits.tolerance_mm < BEYOND_EDGES_MM
-    if form.beyond_edges_share > limits.most_beyond_edges_share and tight and not moved:
+    # another size moves all edges, as it should
+    tight = limits.tolerance_mm < BEYOND_EDGES_MM and not form.scale_error
+    most = limits.most_beyond_edges_share * (3 if form.stock_mm else 1)
+    if form.beyond_edges_share > most and tight:
         yield (
-            f"{form.beyond_edges_share:.1%} of the points lie beyond the part's edges: it may have "
+            f"{form.beyond_edges_share:.2%} of the points lie beyond the part's edges: it may have "
             "stock on one side, which moves the pose by as much, or something touches it"
         )
     if form.field == "facing":
