@@ -52,9 +52,10 @@ def test_what_is_written_is_read_again(tmp_path: Path, written: dict[str, Any]) 
 def test_what_an_old_file_does_not_say_is_none(tmp_path: Path, written: dict[str, Any]) -> None:
     new = ("uncertainty", "form_deviation", "calibration", "tolerance", "verdict", "part")
     found = read(tmp_path, {name: v for name, v in written.items() if name not in new})
-    assert found[1:] == (None,) * 6
-    assert read(tmp_path, written | dict.fromkeys(new))[1:] == (None,) * 6
-    assert read(tmp_path, np.eye(4).tolist())[1:] == (None,) * 6
+    nothing = (*(None,) * 6, False)
+    assert found[1:] == nothing
+    assert read(tmp_path, written | dict.fromkeys(new))[1:] == nothing
+    assert read(tmp_path, np.eye(4).tolist())[1:] == nothing
 
 
 def changed(*at: Any) -> Any:

@@ -1,7 +1,8 @@
-"""The command line: ``vanejax register | compensate | scan | inspect | export``.
+"""The command line: ``vanejax register | place | compensate | scan | inspect | export``.
 
-Exit codes: 0 done, and for ``register`` accepted; 3 ambiguous; 4 rejected; 2 where an argument or
-a file cannot be used; 1 where the machine failed (a full disk); 130 on Ctrl-C. Errors are one line.
+Exit codes: 0 done, and for ``register`` and ``place`` accepted; 3 ambiguous; 4 rejected; 2 where an
+argument or a file cannot be used; 1 where the machine failed (a full disk); 130 on Ctrl-C. Errors
+are one line.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from vanejax.cli import compensate, export, inspect, register, scan
+from vanejax.cli import compensate, export, inspect, place, register, scan
 from vanejax.errors import InputError
 
 _EPILOG = """\
 examples:
   vanejax register scan.ply part.stl
   vanejax register scan.ply part.stl --weights part.npz --json pose.json --report report.html
+  vanejax place scan.ply pose.json part.stl --stock 0.5mm --json placed.json
   vanejax compensate pose.json --camera-pose camera.json --nominal nominal.json --format kuka
   vanejax scan part.stl --out scans --views 12 --noise-mm 0.1
   vanejax inspect scan.ply
@@ -28,6 +30,7 @@ VANEJAX_CACHE_DIR is where compiled programs are kept (~/.cache/vanejax); off ke
 """
 _COMMANDS = {
     "register": (register, "find a part in a scan, and say whether to trust the pose"),
+    "place": (place, "place the finished part in a measured blank, with stock on every face"),
     "compensate": (compensate, "say where a registered part sits in a machine"),
     "scan": (scan, "scan a CAD file virtually from the hemisphere"),
     "inspect": (inspect, "say what a scan or CAD file is"),

@@ -12,7 +12,7 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from vanejax.errors import InputError
 from vanejax.files import write_json
-from vanejax.localization.pose_result import PointStatus, PoseResult
+from vanejax.localization.pose_result import PointStatus, PoseResult, Verdict
 from vanejax.localization.verdict import Limits
+from vanejax.machine.placement import Placement
 from vanejax.rigid import MATRIX_TOLERANCE, RigidTransform, rigid_from_matrix
 
 FORMAT = "vanejax pose"
@@ -46,6 +47,12 @@ _UNCERTAINTY = (
     "about the part's centre c, in the part's frame: x -> c + exp(e[:3]) (x - c) + e[3:]. "
     "It contains how the part differs from its CAD model as far as the scan shows it, and the "
     "sensor's calibration where that was given."
+)
+_PLACEMENT = (
+    "the pose is that of the finished part as placed in the measured blank, not that of the CAD "
+    "model that fits it best; stock is along the surface's normal, where a scan saw the blank, and "
+    "margins are what it is beyond what is required; the sigma is of the scan's noise alone; the "
+    "motion is from the registered pose, along and about the part's axes through its centre"
 )
 
 MAX_BYTES = 16 << 20
@@ -116,11 +123,7 @@ def result_to_dict(
     statuses = np.bincount(np.asarray(checks.status, np.int64), minlength=len(PointStatus))
     return _plain(
         {
-            "format": FORMAT,
-            "version": VERSION,
-            "conventions": CONVENTIONS,
-            "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-            "versions": {name: _version(name) for name in PACKAGES},
+            **_heading(),
             "scan": {"name": scan_name, "sensor_origin_mm": result.sensor_origin},
             "part": {"name": part_name, "sha256": part_sha256},
             "seed": seed,
@@ -173,6 +176,56 @@ def result_to_dict(
 def write_result(path: str | os.PathLike[str], result: PoseResult, **names: Any) -> None:
     """Writes `result_to_dict` (with the same arguments) as JSON, which `read_pose` reads again."""
     write_json(path, result_to_dict(result, **names), allow_nan=False)
+
+
+def placement_to_dict(
+    placement: Placement,
+    verdict: Verdict,
+    *,
+    scan_name: str,
+    part_name: str,
+    part_sha256: str,
+    even: bool,
+    fixed: Sequence[str],
+) -> dict[str, Any]:
+    """A placement in one scan as values that JSON can hold: a pose file without a covariance.
+
+    Relative to the measured points the place has no error: it is chosen.
+
+    Args:
+      placement: of the finished part.
+      verdict: on it.
+      scan_name, part_name: of the files.
+      part_sha256: `Part.sha256`.
+      even, fixed: as they were asked.
+    """
+    least = placement.least
+    return _plain(
+        {
+            **_heading(),
+            "scan": {"name": scan_name},
+            "part": {"name": part_name, "sha256": part_sha256},
+            "verdict": {"status": verdict.status, "reason": verdict.reason},
+            **pose_to_dict(placement.part_from_camera[0]),
+            "placement": {
+                "meaning": _PLACEMENT,
+                "even": even,
+                "fixed": list(fixed),
+                "least_stock_mm": placement.stock_mm[least],
+                "required_mm": placement.required_mm[least],
+                "margin_mm": placement.margin_mm,
+                "margin_sigma_mm": placement.margin_sigma_mm,
+                "least_at_mm": placement.points[least],
+                "least_side": placement.least_side,
+                "held_by": dict(placement.held_by),
+                "seen_share": placement.seen_share,
+                "unopposed_share": placement.unopposed_share,
+                "rotation_vector_deg": np.degrees(placement.motion[:3]),
+                "translation_mm": placement.motion[3:],
+                "converged": placement.converged,
+            },
+        }
+    )
 
 
 def read_pose(path: str | os.PathLike[str]) -> RigidTransform:
@@ -278,6 +331,17 @@ def _matrix(value: Any, where: str) -> np.ndarray:
         return np.array(rows, np.float64).reshape(4, 4)
     except OverflowError:
         raise InputError(f"{where}: the matrix holds a value that is not finite") from None
+
+
+def _heading() -> dict[str, Any]:
+    """What every pose file begins with."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "conventions": CONVENTIONS,
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "versions": {name: _version(name) for name in PACKAGES},
+    }
 
 
 def _version(name: str) -> str | None:

@@ -34,6 +34,7 @@ class PoseRecord(NamedTuple):
       form: how the part as scanned differs from its CAD model.
       calibration: the name of the sensor whose errors of calibration count in the covariance.
       tolerance_mm: what the verdict asked of the pose.
+      has_alternatives: whether it lists other poses that the scan allows.
     """
 
     part_from_camera: RigidTransform
@@ -43,6 +44,7 @@ class PoseRecord(NamedTuple):
     form: FormDeviation | None = None
     calibration: str | None = None
     tolerance_mm: float | None = None
+    has_alternatives: bool = False
 
 
 def read_record(path: str | os.PathLike[str]) -> PoseRecord:
@@ -65,6 +67,7 @@ def read_record(path: str | os.PathLike[str]) -> PoseRecord:
             _form(values.get("form_deviation")),
             _text(values.get("calibration")),
             _tolerance_mm(_entry(values, "tolerance", "mm")),
+            bool(values.get("alternatives")),
         )
     except InputError as error:
         raise InputError(
