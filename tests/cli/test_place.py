@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -113,3 +114,31 @@ def test_a_length_has_its_unit(text: str) -> None:
     assert parse_mm(" 0.5 mm", option="--stock") == 0.5
     with pytest.raises(InputError, match="--stock"):
         parse_mm(text, option="--stock")
+
+
+def masked(text: str) -> str:
+    """What another processor prints too: without figures, and which of two equal sides is worse."""
+    text = re.sub(r"[+-]?\d+(?:[.,]\d+)*", "0", re.sub(r"[+-][xyz]", "side", text.strip()))
+    return re.sub(r"held by .*", "held by", text)
+
+
+def test_its_page_runs_as_written(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "placement.md").read_text()
+    blocks = re.findall(r"^```(sh|python|text)\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    shown, printed = 0, ""
+    for language, block in blocks:
+        if language == "text":
+            assert masked(printed) == masked(block)
+            shown += 1
+        elif language == "python":
+            exec(compile(block, "placement.md", "exec"), {})
+            printed = capsys.readouterr().out
+        else:
+            assert main(shlex.split(block)[1:]) == 0
+            printed = capsys.readouterr().out
+    assert shown == 3
+    moved = json.loads(Path("placed.json").read_text())["placement"]
+    # turned by 0.4 deg, and 1 mm of stock on either side across y
+    assert moved["rotation_vector_deg"][2] == pytest.approx(0.4, abs=0.03)
+    assert moved["margin_mm"] == pytest.approx(0.5, abs=0.04)
