@@ -15,7 +15,7 @@ from matplotlib.text import Text
 from vanejax.cad import part_from_mesh
 from vanejax.localization.deviation_patches import scaled_pose
 from vanejax.localization.pose_result import FormDeviation, PointStatus, Verification
-from vanejax.plotting import deviation_map, overlay_before_after, residual_histogram
+from vanejax.plotting import deviation_map, overlay_before_after, residual_histogram, stock_map
 from vanejax.plotting.canvas import FAR_ABOVE, NO_PARTNER
 from vanejax.plotting.deviation import (
     color_limit_mm,
@@ -354,3 +354,17 @@ def test_before_and_after_have_one_frame_and_differ():
     assert np.count_nonzero(differs) > 0.1 * np.count_nonzero(solid)
     words = texts(overlay_before_after(case.result, case.scan, case.part))
     assert {"before", "after", "scan", "CAD"} <= set(words.split("\n"))
+
+
+def test_the_map_of_the_stock_spans_it_and_is_grey_where_it_is_unknown():
+    mesh = trimesh.creation.box((40.0, 60.0, 10.0))
+    part = part_from_mesh(mesh.vertices, mesh.faces, name="box")
+    points, normals, _ = part.sample(2000, 0)
+    stock = np.where(normals[:, 2] > 0.5, 1.0, np.where(normals[:, 2] < -0.5, np.nan, 2.0))
+    above, below, bar = stock_map(part, points, normals, stock).axes
+    assert bar.get_ylim() == pytest.approx((0.995, 2.005))
+    grey = [
+        np.mean(np.ptp(np.asarray(axes.images[0].get_array(), float)[..., :3], axis=2) < 0.06)
+        for axes in (above, below)
+    ]
+    assert grey[1] > grey[0] + 0.2

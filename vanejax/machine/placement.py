@@ -348,13 +348,22 @@ class _Problem:
         return found.x[:6] - found.x[6:12]
 
     def most_even(self, motion: np.ndarray) -> np.ndarray:
-        """From a motion [6] with the required stock to that with the least variance of margins."""
+        """From a motion [6] with the required stock to that with the least variance of margins.
+
+        Of opposed faces together, and of the unopposed ones of each side.
+        """
         if not self.opposed.any():
             return motion
+        # unopposed faces are even each by itself: to be like the others they would have to move
+        normals = self.meter.finished.normals[self.rows]
+        axis = np.argmax(np.abs(normals), axis=1)
+        sides = 1 + 2 * axis + (np.take_along_axis(normals, axis[:, None], 1)[:, 0] < 0)
+        groups = np.where(self.opposed, 0, sides)
         for _ in range(STEPS):
             margin, change = self.margins(motion)
-            uneven = margin[self.opposed], change[self.opposed]
-            uneven, rows = ((v - v.mean(axis=0)) / np.sqrt(len(v)) for v in uneven)
+            uneven, rows = (
+                _about_means(values, groups) / np.sqrt(len(groups)) for values in (margin, change)
+            )
             stay = LEAST_GAIN * np.eye(6)
             toward = self.along[None] * UNOPPOSED_COST
             matrix = np.vstack([rows, stay, toward])[:, self.free]
@@ -367,6 +376,14 @@ class _Problem:
             if np.abs(step).max() < LAST_STEP_MM:
                 break
         return motion
+
+
+def _about_means(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Values [m, ...] less the mean of their group [m]."""
+    values = values.copy()
+    for group in np.unique(groups):
+        values[groups == group] -= values[groups == group].mean(axis=0)
+    return values
 
 
 def _least_squares(

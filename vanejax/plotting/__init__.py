@@ -15,7 +15,12 @@ from vanejax.plotting.clouds import (
     view_and_shadow,
     view_name,
 )
-from vanejax.plotting.deviation import deviation_map, overlay_before_after, residual_histogram
+from vanejax.plotting.deviation import (
+    deviation_map,
+    overlay_before_after,
+    residual_histogram,
+    stock_map,
+)
 from vanejax.plotting.overview import overview_picture
 from vanejax.plotting.shading import part_picture, shade
 
@@ -35,6 +40,7 @@ __all__ = [
     "residual_histogram",
     "save_figure",
     "shade",
+    "stock_map",
     "training_curves",
     "view_and_shadow",
     "view_name",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize, to_rgb
 from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
 
 from vanejax.cad import Part
 from vanejax.localization.assessment import without_form_deviation
@@ -42,6 +44,7 @@ _PIXELS = 900
 _FIELD_DEG = 12.0  # from so far away a millimetre is nearly as long everywhere
 _SIDES_DEG = {"from above": (30.0, 40.0), "from below": (-25.0, 220.0)}  # elevation, azimuth
 _REACH_MM = 4.0  # no casting is off by half of it
+_FACING = 0.5  # of the part's radius: as far apart count points that face at right angles
 _SAME_FACE = 0.9  # cosine: the CAD face under a point of the casting, not the one round an edge
 
 
@@ -373,19 +376,49 @@ def casting_map(part: Part, cast: Part) -> Figure:
       part: the CAD model.
       cast: its casting, in the same frame, as from `vanejax.cad.investment_casting.as_cast`.
     """
-    distance = 1.05 * cast.radius / np.sin(np.radians(_FIELD_DEG) / 2)
+    bare = Scanner(part)
+    label = "offset from the CAD surface (mm), + outward"
+    return _painted(cast, lambda scan: _offset_mm(scan, bare), label)
+
+
+def stock_map(part: Part, points: np.ndarray, normals: np.ndarray, stock_mm: np.ndarray) -> Figure:
+    """The finished part from two opposite sides, coloured by the stock that a blank has over it.
+
+    Grey is where the stock is not known.
+
+    Args:
+      part: the finished part.
+      points: [n, 3] mm, on its surface.
+      normals: [n, 3], unit.
+      stock_mm: [n], NaN where it is not known, as from `vanejax.machine.place`.
+    """
+    facing = _FACING * part.radius
+    tree = cKDTree(np.hstack([points, facing * normals]))
+
+    def stock(scan: Scan) -> np.ndarray:
+        part_from_camera = scan.camera_from_part.inverse()
+        seen = part_from_camera.apply(scan.points.astype(np.float64))
+        turned = part_from_camera.rotate(scan.normals.astype(np.float64))
+        return stock_mm[tree.query(np.hstack([seen, facing * turned]))[1]]
+
+    return _painted(part, stock, "stock over the finished surface (mm)")
+
+
+def _painted(solid: Part, values_mm: Callable[[Scan], np.ndarray], label: str) -> Figure:
+    """A solid from two opposite sides, coloured by what a function says of a scan's points."""
+    distance = 1.05 * solid.radius / np.sin(np.radians(_FIELD_DEG) / 2)
     camera = Camera(
         width=_PIXELS, height=_PIXELS, fov_x_deg=_FIELD_DEG, fov_y_deg=_FIELD_DEG,
-        near_mm=distance - 1.5 * cast.radius, far_mm=distance + 1.5 * cast.radius,
+        near_mm=distance - 1.5 * solid.radius, far_mm=distance + 1.5 * solid.radius,
     )  # fmt: skip
-    scanner, bare = Scanner(cast), Scanner(part)
+    scanner = Scanner(solid)
     scans = []
     for elevation, azimuth in _SIDES_DEG.values():
         view = hemisphere_viewpoints(
-            cast.center, distance_mm=distance, elevations_deg=[elevation], azimuths_deg=[azimuth]
+            solid.center, distance_mm=distance, elevations_deg=[elevation], azimuths_deg=[azimuth]
         ).view(0)
         scans.append(scanner.scan(camera, view))
-    offsets = [_offset_mm(scan, bare) for scan in scans]
+    offsets = [values_mm(scan) for scan in scans]
     scale, colors = _offset_scale(np.concatenate(offsets))
     sizes = [crop_size(scan, camera) for scan in scans]
     widths = [wide / high for wide, high in sizes]
@@ -401,7 +434,6 @@ def casting_map(part: Part, cast: Part) -> Figure:
         image.reshape(-1, 3)[scan.pixel] = color * (0.55 + 0.45 * bright)
         draw_part(axes, scan, camera, image)
         canvas.name_panel(axes, title)
-    label = "offset from the CAD surface (mm), + outward"
     canvas.add_color_bar(
         figure, panels, ScalarMappable(scale, colors), label, fraction=0.025, extend="both"
     )
