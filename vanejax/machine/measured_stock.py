@@ -81,7 +81,7 @@ def measured_surface(scans: Sequence[tuple[MeasuredScan, RigidTransform]]) -> Me
     chosen = np.arange(len(points))
     if len(points) > PLANES:
         chosen = np.random.default_rng(0).choice(len(points), PLANES, replace=False)
-    count = int(np.clip(OVERLAP * len(points) / PLANES, *NEIGHBORS))
+    count = min(int(np.clip(OVERLAP * len(points) / PLANES, *NEIGHBORS)), len(points))
     distance, index = cKDTree(points).query(points[chosen], k=count)
     reach = distance[:, -1]
     planes = _fit_planes(points[index], reach)
