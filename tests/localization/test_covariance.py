@@ -10,10 +10,11 @@ from example_result import example_result
 from example_scans import ideal_scan, model, vane
 from scipy.spatial.transform import Rotation
 
-from vanejax.localization.covariance import PATCHES, inflation, uncertainty
+from vanejax.localization.covariance import PATCHES, inflation, moved_to, uncertainty
 from vanejax.localization.pose_result import Refinement, magnitude_bound
 from vanejax.localization.residuals import SurfaceMatching
 from vanejax.localization.scan_patches import patch_labels
+from vanejax.rigid import RigidTransform
 
 
 def refinement(information: np.ndarray) -> Refinement:
@@ -113,3 +114,47 @@ def test_a_magnitude_is_within_its_bound_as_often_as_it_says(sigmas) -> None:
     assert np.mean(within) == pytest.approx(0.95, abs=0.004)
     stacked = magnitude_bound(np.stack([covariance, 4 * covariance, np.zeros((3, 3))]))
     np.testing.assert_allclose(stacked, stacked[0] * np.array([1, 2, 0]), rtol=1e-12)
+
+
+def test_a_free_rotation_is_in_no_bound():
+    """A turn about the free axis says nothing; what is known of the rest stays."""
+    axis = (np.array([5.0, -3.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    center = np.array([1.0, 2.0, 3.0])
+    moves = np.concatenate([axis[1], np.cross(axis[1], center - axis[0])])
+    rng = np.random.default_rng(0)
+    columns = rng.normal(size=(50, 6)) * np.repeat([1e3, 10], 3)
+    columns -= np.outer(columns @ moves, moves) / (moves @ moves)  # a turn changes no residual
+    information = columns.T @ columns
+    result = uncertainty(refinement(information), center, axis)
+    assert np.isinf(result.rotation_sigma_deg[2])
+    assert np.isfinite(result.rotation_sigma_deg[:2]).all()
+    np.testing.assert_array_equal(result.free_axis, axis[1])
+    assert abs(result.weakest_rotation_axis[2]) < 1e-9
+    np.testing.assert_allclose(result.covariance[2], 0, atol=1e-15)
+    # of any solution of the normal equations, that which does not turn about the axis
+    without_turn = np.eye(6)
+    without_turn[:, 2] -= moves / moves[2]
+    expected = without_turn @ np.linalg.pinv(information, hermitian=True) @ without_turn.T
+    np.testing.assert_allclose(result.covariance, expected, rtol=1e-6, atol=1e-14)
+    assert result.rotation_bound_deg < 1
+    assert uncertainty(refinement(information), center).rotation_bound_deg > 90
+
+
+def test_an_equivalent_pose_has_the_information_of_its_own_frame():
+    """An error before the motion is the same as one after it, in the turned frame."""
+    rng = np.random.default_rng(1)
+    center = np.array([4.0, -2.0, 7.0])
+    turn = Rotation.from_euler("xyz", [20, 70, -130], degrees=True).as_matrix()
+    motion = RigidTransform(turn, np.array([3.0, 8.0, -5.0]))
+    columns = rng.normal(size=(30, 6))
+    old = refinement(columns.T @ columns)
+    new = moved_to(old, motion @ old.part_from_camera, center)
+    for e in 1e-6 * rng.normal(size=(5, 6)):
+        small = RigidTransform(
+            Rotation.from_rotvec(e[:3]).as_matrix(),
+            center + e[3:] - Rotation.from_rotvec(e[:3]).as_matrix() @ center,
+        )
+        after = motion @ small @ motion.inverse()
+        turned = Rotation.from_matrix(after.rotation).as_rotvec()
+        moved = np.concatenate([turned, after.apply(center[None])[0] - center])
+        assert moved @ new.information @ moved == pytest.approx(e @ old.information @ e, rel=1e-4)

@@ -202,6 +202,76 @@ def test_a_rough_guess_decides_between_symmetric_poses(turn):
     assert note.startswith("3 other poses fit as well, one turned by 180.0 deg")
 
 
+@pytest.mark.parametrize("turn", [None, [0, 0, 0], [180, 0, 0]])
+def test_a_declared_symmetry_makes_one_pose_of_all_that_fit(turn):
+    """Without a guess the least turned one is reported, with one the nearest."""
+    points, truth = scan_of("box", 5)
+    turns = [np.zeros(3), *(180 * np.eye(3))]
+    right = [motion(box(), t, np.zeros(3)) @ truth for t in turns]
+    wanted = min(right, key=lambda p: Rotation.from_matrix(p.rotation).magnitude())
+    init = None
+    if turn is not None:
+        wanted = motion(box(), np.array(turn, float), np.zeros(3)) @ truth
+        init = disturbed(box(), wanted, 4, 3, seed=1)
+    result = register(points, box(), init=init, max_allowance_mm=0.0, symmetry="x:180,y:180")
+    assert_right(result, box(), wanted)
+    assert result.alternatives == ()
+    assert max(pose_error(box(), result.before, wanted)) < 5.1
+    (note,) = (note for note in result.notes if "symmetry" in note)
+    assert note.startswith("symmetry x:180,y:180: 4 poses are one")
+    assert ("nearest to the guess" in note) == (turn is not None)
+    assert not any("the guess rules" in note for note in result.notes)
+    e = small_motion(box(), result.part_from_camera, wanted)
+    assert e @ np.linalg.solve(result.uncertainty.covariance, e) < 30
+
+
+def test_half_a_symmetry_leaves_the_other_poses():
+    """Of the box's four poses two are one by the declared turn; the others still compete."""
+    points, _ = scan_of("box", 5)
+    result = register(points, box(), max_allowance_mm=0.0, symmetry="z:180")
+    assert result.verdict.status == "ambiguous"
+    assert len(result.alternatives) == 1
+    assert result.alternatives[0].rotation_deg == pytest.approx(180, abs=0.5)
+
+
+@functools.cache
+def shaft() -> Part:
+    """Turned about z, with steps of 12, 20 and 15 mm radius: no other symmetry."""
+    steps = [
+        trimesh.creation.cylinder(r, segment=[[0, 0, z0], [0, 0, z1]], sections=96)
+        for r, z0, z1 in ((12, 0, 40), (20, 40, 60), (15, 60, 120))
+    ]
+    mesh = trimesh.boolean.union(steps)
+    return part_from_mesh(mesh.vertices + np.array([7.0, -4.0, 11.0]), mesh.faces, name="shaft")
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_the_rotation_of_a_shaft_is_free_and_the_rest_is_known(seed):
+    points, truth = measured_points(shaft(), random_view(shaft(), seed), seed=seed)
+    assert register(points, shaft(), max_allowance_mm=0.0).verdict.status == "ambiguous"
+    result = register(points, shaft(), max_allowance_mm=0.0, symmetry="z:any")
+    assert result.verdict.status == "accepted", result.verdict.reason
+    assert result.verdict.reason.endswith("the rotation about the part's z is free by symmetry")
+    assert result.alternatives == ()
+    found, uncertainty = result.part_from_camera, result.uncertainty
+    assert np.isinf(uncertainty.rotation_sigma_deg[2])
+    right = result.symmetry.canonical(truth, found)  # of all right poses the nearest
+    e = small_motion(shaft(), found, right)
+    assert abs(e[2]) < 1e-6
+    known = np.delete(np.arange(6), 2)
+    covariance = uncertainty.covariance[np.ix_(known, known)]
+    assert e[known] @ np.linalg.solve(covariance, e[known]) < 30
+    assert uncertainty.rotation_bound_deg < 0.05
+    np.testing.assert_allclose(
+        result.symmetry.canonical(found).as_matrix(), found.as_matrix(), atol=1e-6
+    )
+
+
+def test_a_symmetry_that_the_cad_model_does_not_have_is_refused():
+    with pytest.raises(InputError, match=r"symmetry z:180: the CAD model does not have it"):
+        register(scan_of("bracket", 1)[0], bracket(), symmetry="z:180")
+
+
 @pytest.mark.slow
 def test_the_scan_of_another_part_is_not_accepted():
     result = register(scan_of("bracket", 1)[0], box(), sensor_origin=np.zeros(3))

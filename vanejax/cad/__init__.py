@@ -6,6 +6,7 @@ and castings of it that differ from the model as investment castings do.
 """
 
 from vanejax.cad.casting_tolerances import dimensional_tolerance_mm
+from vanejax.cad.declared_symmetry import PartSymmetry, Symmetry
 from vanejax.cad.investment_casting import (
     InvestmentCasting,
     as_cast,
@@ -22,7 +23,9 @@ __all__ = [
     "InvestmentCasting",
     "NearestFace",
     "Part",
+    "PartSymmetry",
     "Surface",
+    "Symmetry",
     "Triangles",
     "as_cast",
     "dimensional_tolerance_mm",

@@ -177,6 +177,48 @@ def near_symmetries(
     return np.array([m for _, m in kept]).reshape(-1, 4, 4)
 
 
+def nearest_equivalents(
+    part_from_camera: RigidTransform,
+    other: RigidTransform,
+    symmetries: np.ndarray,
+    *,
+    center: np.ndarray,
+    radius_mm: float,
+    continuous_axis: Axis | None = None,
+) -> RigidTransform:
+    """Of all poses that are as right as each of a batch, the nearest to one other pose.
+
+    With E = part_from_camera @ other^-1, a motion of the part's frame, and a symmetry S, what is
+    left is S^-1 E: its angle, and by how much it moves the part's centre. That symmetry is taken
+    for which angle in radians times radius plus that distance is smallest. About a continuous axis
+    u the turn that leaves the smallest angle is taken out first: of the quaternion (w, v) the twist
+    2 atan2(v.u, w).
+
+    Args:
+      part_from_camera: poses [H, 3, 3] and [H, 3], mm.
+      other: one pose.
+      symmetries: [S, 4, 4] in the part's frame, identity included.
+      center, radius_mm: `Part.center` and `Part.radius`.
+      continuous_axis: point [3] and unit direction [3] in the part's frame, or None.
+
+    Returns:
+      Poses [H, 3, 3] and [H, 3].
+    """
+    error = (part_from_camera @ other.inverse()).as_matrix()
+    rest = np.linalg.inv(symmetries) @ error[:, None]
+    if continuous_axis is not None:
+        point, direction = continuous_axis
+        quaternion = Rotation.from_matrix(rest[..., :3, :3].reshape(-1, 3, 3)).as_quat()
+        twist = 2 * np.arctan2(quaternion[:, :3] @ direction, quaternion[:, 3])
+        turn = Rotation.from_rotvec(-twist[:, None] * direction[None]).as_matrix()
+        back = RigidTransform(turn, point - turn @ point).as_matrix()
+        rest = back.reshape(rest.shape) @ rest
+    angle = Rotation.from_matrix(rest[..., :3, :3].reshape(-1, 3, 3)).magnitude()
+    shift = np.linalg.norm(rest[..., :3, :3] @ center + rest[..., :3, 3] - center, axis=-1)
+    best = np.argmin(angle.reshape(shift.shape) * radius_mm + shift, axis=1)
+    return RigidTransform.from_matrix(rest[np.arange(len(rest)), best]) @ other
+
+
 def pose_error(
     part_from_camera: RigidTransform,
     truth: RigidTransform,
@@ -188,30 +230,23 @@ def pose_error(
 ) -> tuple[float, float]:
     """How far a pose is from the nearest of all right ones.
 
-    With E = part_from_camera @ truth^-1, a motion of the part's frame, and a symmetry S, the error
-    is S^-1 E: its angle, and by how much it moves the part's centre. Of the symmetries that one
-    counts for which angle in radians times radius plus that distance is smallest. About a
-    continuous axis u the turn that leaves the smallest angle is taken out first: of the quaternion
-    (w, v) the twist 2 atan2(v.u, w).
-
     Args:
       part_from_camera, truth: the pose and a right one, mm.
-      symmetries: [S, 4, 4] in the part's frame, identity included.
-      center, radius_mm: `Part.center` and `Part.radius`.
-      continuous_axis: point [3] and unit direction [3] in the part's frame, or None.
+      symmetries, center, radius_mm, continuous_axis: as for `nearest_equivalents`.
 
     Returns:
       rotation_deg in [0, 180], translation_mm at the centre.
     """
-    error = (part_from_camera @ truth.inverse()).as_matrix()
-    rest = np.linalg.inv(symmetries) @ error
-    if continuous_axis is not None:
-        point, direction = continuous_axis
-        quaternion = Rotation.from_matrix(rest[:, :3, :3]).as_quat()
-        twist = 2 * np.arctan2(quaternion[:, :3] @ direction, quaternion[:, 3])
-        back = [rotation_about(direction, angle, point) for angle in -np.degrees(twist)]
-        rest = np.stack(back) @ rest
-    angle = Rotation.from_matrix(rest[:, :3, :3]).magnitude()
-    shift = np.linalg.norm(rest[:, :3, :3] @ center + rest[:, :3, 3] - center[None], axis=-1)
-    best = np.argmin(angle * radius_mm + shift)
-    return math.degrees(angle[best]), float(shift[best])
+    batch = RigidTransform(part_from_camera.rotation[None], part_from_camera.translation[None])
+    nearest = nearest_equivalents(
+        batch,
+        truth,
+        symmetries,
+        center=center,
+        radius_mm=radius_mm,
+        continuous_axis=continuous_axis,
+    )
+    rest = nearest @ truth.inverse()
+    angle = Rotation.from_matrix(rest.rotation[0]).magnitude()
+    shift = np.linalg.norm(rest.apply(center[None])[0, 0] - center)
+    return math.degrees(angle), float(shift)

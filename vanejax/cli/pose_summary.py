@@ -92,6 +92,8 @@ def _row(values: Sequence[float]) -> str:
 
 
 def _number(value: float) -> str:
+    if value == math.inf:
+        return "free"
     return f"{value:.4f}" if math.isfinite(value) else "unknown"
 
 

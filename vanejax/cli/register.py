@@ -87,6 +87,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a stereo camera whose matching window rounds edges off, which is then taken out of "
         "the scan: consumer_depth",
     )
+    parser.add_argument(
+        "--symmetry",
+        metavar="AXIS:DEG,...",
+        default="none",
+        help="poses that are one: z:180 (the part is the same after a half turn about z of the CAD "
+        "frame), z:any (a turned part), several with commas; auto finds it in CAD; none (default)",
+    )
     parser.add_argument("--json", metavar="FILE", help="write the pose and all figures here")
     parser.add_argument("--report", metavar="FILE", help="write an HTML report here")
     parser.add_argument("--seed", type=int, default=0, help="of what is drawn at random (0)")
@@ -106,11 +113,13 @@ def run(arguments: argparse.Namespace) -> int:
     tolerance_mm, tolerance_deg = parse_mm_deg(arguments.tolerance, option="--tolerance")
     _check_outputs(arguments)
 
+    from vanejax.cad.declared_symmetry import Symmetry
     from vanejax.localization.sensor_calibration import Calibration
     from vanejax.localization.verdict import Limits
     from vanejax.machine.pose_file import read_pose, write_result
 
     limits = Limits(tolerance_mm=tolerance_mm, tolerance_deg=tolerance_deg)
+    symmetry = Symmetry.parse(arguments.symmetry)
     calibration = None
     if arguments.calibration is not None:
         calibration = Calibration.of(arguments.calibration)
@@ -147,6 +156,7 @@ def run(arguments: argparse.Namespace) -> int:
         form_tolerance_mm=arguments.form_tolerance_mm,
         calibration=calibration,
         sensor=arguments.sensor,
+        symmetry=symmetry,
         seed=arguments.seed,
     )
     ended = time.perf_counter()

@@ -10,6 +10,7 @@ import dataclasses
 
 import numpy as np
 
+from vanejax.cad.declared_symmetry import PartSymmetry
 from vanejax.localization.covariance import uncertainty
 from vanejax.localization.deviation_patches import as_designed, scaled_pose
 from vanejax.localization.fine_registration import robust_gauss_newton, subset
@@ -68,13 +69,18 @@ def compared_points(points: np.ndarray, seed: int) -> np.ndarray:
 
 
 def competing_hypotheses(
-    model: MeasurementModel, points: np.ndarray, candidates: Candidates, *, seed: int = 0
+    model: MeasurementModel,
+    points: np.ndarray,
+    candidates: Candidates,
+    *,
+    seed: int = 0,
+    symmetry: PartSymmetry | None = None,
 ) -> Candidates:
     """The best candidates and symmetry hypotheses, converged and scored by the same points.
 
     Not sorted, nor are poses that met left out: see `choose`.
     """
-    pool = add_symmetry_hypotheses(model, points, candidates, seed=seed)
+    pool = add_symmetry_hypotheses(model, points, candidates, seed=seed, symmetry=symmetry)
     sample = compared_points(points, seed)
     poses = select(pool.part_from_camera, slice(0, 1 + MOST_HYPOTHESES))
     poses = converge_fully(model, poses, sample)
@@ -85,15 +91,19 @@ def competing_hypotheses(
 
 
 def choose(
-    model: MeasurementModel, hypotheses: Candidates, guess: RigidTransform | None = None
+    model: MeasurementModel,
+    hypotheses: Candidates,
+    guess: RigidTransform | None = None,
+    symmetry: PartSymmetry | None = None,
 ) -> RigidTransform:
     """Distinct poses [H, 3, 3] in the order in which they are tried: near the guess, then score."""
     poses, score = hypotheses.part_from_camera, hypotheses.score
     far = np.zeros(len(score), bool)
     if guess is not None:
-        far = ~_is_near_guess(*distances(poses, guess, model.part), model)
+        far = ~_is_near_guess(*distances(poses, guess, model.part, symmetry), model)
     order = np.lexsort((-score, far))  # the last key counts most
-    return select(poses, order[distinct(select(poses, order), model.part, len(order))])
+    kept = distinct(select(poses, order), model.part, len(order), symmetry)
+    return select(poses, order[kept])
 
 
 def assess(
@@ -105,6 +115,7 @@ def assess(
     guess: RigidTransform | None = None,
     limits: Limits | None = None,
     seed: int = 0,
+    symmetry: PartSymmetry | None = None,
 ) -> Assessment:
     """Verifies a refined pose, compares it with hypotheses, and judges it.
 
@@ -116,16 +127,18 @@ def assess(
       guess: rough part_from_camera; hypotheses far from it count where they fit better only.
       limits: of the verdict.
       seed: of the subsets of points.
+      symmetry: of the part; poses that it makes one do not compete.
     """
     limits = limits or Limits()
     part, pose = model.part, refinement.part_from_camera
     sample = compared_points(points, seed)
     tolerance = float(inlier_tolerance_mm(model, stack(pose), sample)[0])
     competing, ruled_out = _compare(
-        model, sample, concatenate(stack(pose), hypotheses), tolerance, guess, limits
+        model, sample, concatenate(stack(pose), hypotheses), tolerance, guess, limits, symmetry
     )
     verification = _verify(model, points, refinement, tolerance, seed)
-    sigma = uncertainty(refinement, part.center)
+    free_axis = None if symmetry is None else symmetry.free_axis
+    sigma = uncertainty(refinement, part.center, free_axis)
     verdict = judge(
         verification,
         sigma,
@@ -183,14 +196,17 @@ def _compare(
     tolerance_mm: float,
     guess: RigidTransform | None,
     limits: Limits,
+    symmetry: PartSymmetry | None,
 ) -> tuple[tuple[CompetingHypothesis, ...], tuple[CompetingHypothesis, ...]]:
     """The poses that compete with the first one, and those that only the guess rules out."""
     view = view_of(model, points)
     scores = evidence(model, poses, points, tolerance_mm=tolerance_mm, view=view)
+    if symmetry is not None:
+        poses = symmetry.nearest(poses, select(poses, 0))
     angle_deg, shift_mm = distances(poses, select(poses, 0), model.part)
     near_guess = np.ones(len(angle_deg), bool)
     if guess is not None:
-        near_guess = _is_near_guess(*distances(poses, guess, model.part), model)
+        near_guess = _is_near_guess(*distances(poses, guess, model.part, symmetry), model)
     competing, ruled_out = [], []
     for k in np.flatnonzero(~is_same(angle_deg, shift_mm, model.part)):
         other = CompetingHypothesis(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from vanejax.cad.declared_symmetry import PartSymmetry
 from vanejax.cad.part import Part
 from vanejax.rigid import RigidTransform
 
@@ -32,9 +33,14 @@ def concatenate(*batches: RigidTransform) -> RigidTransform:
 
 
 def distances(
-    poses: RigidTransform, other: RigidTransform, part: Part
+    poses: RigidTransform, other: RigidTransform, part: Part, symmetry: PartSymmetry | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[H] deg and [H] mm between H poses and one other; the shift is of the part's centre."""
+    """[H] deg and [H] mm between H poses and one other; the shift is of the part's centre.
+
+    Of poses that are one by the part's symmetry the nearest counts.
+    """
+    if symmetry is not None:
+        poses = symmetry.nearest(poses, other)
     between = other.rotation @ poses.rotation.swapaxes(-1, -2)
     angle_deg = np.degrees(Rotation.from_matrix(between.reshape(-1, 3, 3)).magnitude())
     # where the other pose puts what each pose has at the centre
@@ -48,11 +54,14 @@ def is_same(angle_deg: np.ndarray, shift_mm: np.ndarray, part: Part) -> np.ndarr
     return (angle_deg < SAME_DEG) & (shift_mm < SAME_SHIFT * part.radius)
 
 
-def distinct(poses: RigidTransform, part: Part, most: int) -> np.ndarray:
-    """Indices of at most ``most`` poses that are not near one before them."""
+def distinct(
+    poses: RigidTransform, part: Part, most: int, symmetry: PartSymmetry | None = None
+) -> np.ndarray:
+    """Indices of at most ``most`` poses that are not near one before them, see `distances`."""
     kept: list[int] = []
     for index in range(len(poses.rotation)):
-        near = distances(select(poses, np.array(kept, int)), select(poses, index), part)
+        known = select(poses, np.array(kept, int))
+        near = distances(known, select(poses, index), part, symmetry)
         if not is_same(*near, part).any():
             kept.append(index)
         if len(kept) == most:

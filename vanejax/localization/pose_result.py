@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import gammaincinv
 
+from vanejax.cad.declared_symmetry import PartSymmetry
 from vanejax.rigid import RigidTransform
 
 SURE = 0.95  # of the errors are within a bound
@@ -49,12 +50,15 @@ class Uncertainty:
     Attributes:
       covariance: [6, 6], of e = (rotation vector in rad, translation in mm).
       center: [3] mm, c.
-      rotation_sigma_deg: [3], about the part's x, y, z.
+      rotation_sigma_deg: [3], about the part's x, y, z; infinite where a free rotation turns.
       translation_sigma_mm: [3], along the part's x, y, z, at its centre.
       weakest_rotation_axis: [3] unit, the axis about which the rotation is least certain.
       weakest_rotation_sigma_deg: about that axis.
       weakest_translation_axis: [3] unit, the direction in which the translation is least certain.
       weakest_translation_sigma_mm: along it.
+      free_axis: [3] unit, part frame: about it the rotation is free by the part's symmetry, and
+        the covariance is of the equivalent error that does not turn about it; None where there is
+        none.
     """
 
     covariance: np.ndarray
@@ -65,6 +69,7 @@ class Uncertainty:
     weakest_rotation_sigma_deg: float
     weakest_translation_axis: np.ndarray
     weakest_translation_sigma_mm: float
+    free_axis: np.ndarray | None = None
 
     @property
     def rotation_bound_deg(self) -> float:
@@ -268,6 +273,7 @@ class PoseResult:
       sensor_origin: [3] mm, scan frame; None where unknown.
       notes: what was assumed, dropped or repaired, a sentence each.
       seconds: wall time of each stage by name, in order.
+      symmetry: by which poses count as one; None where nothing was declared.
     """
 
     part_from_camera: RigidTransform
@@ -280,6 +286,7 @@ class PoseResult:
     sensor_origin: np.ndarray | None
     notes: tuple[str, ...]
     seconds: Mapping[str, float]
+    symmetry: PartSymmetry | None = None
 
     @property
     def camera_from_part(self) -> RigidTransform:

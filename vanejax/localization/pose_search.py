@@ -14,6 +14,7 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from vanejax.cad.declared_symmetry import PartSymmetry
 from vanejax.localization.fine_registration import robust_gauss_newton, subset
 from vanejax.localization.pose_batch import concatenate, distinct, select
 from vanejax.localization.residuals import MeasurementModel, RayCasting
@@ -97,6 +98,7 @@ def search(
     extra: RigidTransform | None = None,
     count: int = INITIAL_ROTATIONS,
     seed: int = 0,
+    symmetry: PartSymmetry | None = None,
 ) -> Candidates:
     """The poses that explain the scan best, from no guess.
 
@@ -106,6 +108,7 @@ def search(
       extra: [E] poses to try beside the uniform ones.
       count: how many rotations to start from; 0 takes ``extra`` alone.
       seed: of the subsets of points.
+      symmetry: of the part; of the poses that it makes one, the best is a candidate.
     """
     sample = points[subset(points, INITIAL_POINTS, seed)]
     poses = None
@@ -123,23 +126,33 @@ def search(
     residuals = model.residuals(poses, sample, precision="grid")
     score = np.clip(1 - (residuals.deviation_mm / tolerance) ** 2, 0, None)
     score[residuals.hit & (residuals.deviation_mm < -tolerance)] = -0.5
-    best = _best_first(model, poses, score.mean(axis=1), MOST_CANDIDATES)
-    return converge(model, points, best.part_from_camera, seed=seed)
+    best = _best_first(model, poses, score.mean(axis=1), MOST_CANDIDATES, symmetry)
+    return converge(model, points, best.part_from_camera, seed=seed, symmetry=symmetry)
 
 
 def converge(
-    model: MeasurementModel, points: np.ndarray, poses: RigidTransform, *, seed: int = 0
+    model: MeasurementModel,
+    points: np.ndarray,
+    poses: RigidTransform,
+    *,
+    seed: int = 0,
+    symmetry: PartSymmetry | None = None,
 ) -> Candidates:
     """Converges poses with more points, merges those that meet, and sorts them."""
     sample = points[subset(points, CANDIDATE_POINTS, seed + 1)]
     poses, _ = robust_gauss_newton(
         model, poses, sample, iterations=CANDIDATE_ITERATIONS, min_step_deg=0.02
     )
-    return _best_first(model, poses, _scores(model, poses, sample), len(poses.rotation))
+    return _best_first(model, poses, _scores(model, poses, sample), len(poses.rotation), symmetry)
 
 
 def add_symmetry_hypotheses(
-    model: MeasurementModel, points: np.ndarray, candidates: Candidates, *, seed: int = 0
+    model: MeasurementModel,
+    points: np.ndarray,
+    candidates: Candidates,
+    *,
+    seed: int = 0,
+    symmetry: PartSymmetry | None = None,
 ) -> Candidates:
     """The candidates, and the best moved by the part's own similarities, sorted anew."""
     sample = points[subset(points, SYMMETRY_POINTS, seed + 4)]
@@ -154,7 +167,8 @@ def add_symmetry_hypotheses(
     )
     known = select(candidates.part_from_camera, slice(0, MOST_SYMMETRY_HYPOTHESES))
     poses = concatenate(known, symmetric)
-    ranked = _best_first(model, poses, _scores(model, poses, sample), MOST_SYMMETRY_HYPOTHESES)
+    scores = _scores(model, poses, sample)
+    ranked = _best_first(model, poses, scores, MOST_SYMMETRY_HYPOTHESES, symmetry)
     best = ranked.score[0]
     kept = ranked.score >= best - (1 - LEAST_SCORE) * abs(best)
     return Candidates(select(ranked.part_from_camera, kept), ranked.score[kept])
@@ -177,9 +191,13 @@ def _scores(model: MeasurementModel, poses: RigidTransform, points: np.ndarray) 
 
 
 def _best_first(
-    model: MeasurementModel, poses: RigidTransform, score: np.ndarray, most: int
+    model: MeasurementModel,
+    poses: RigidTransform,
+    score: np.ndarray,
+    most: int,
+    symmetry: PartSymmetry | None,
 ) -> Candidates:
     """At most ``most`` distinct poses, the best first."""
     order = np.argsort(-score, kind="stable")
-    order = order[distinct(select(poses, order), model.part, most)]
+    order = order[distinct(select(poses, order), model.part, most, symmetry)]
     return Candidates(select(poses, order), score[order])

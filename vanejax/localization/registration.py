@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vanejax.cad.declared_symmetry import PartSymmetry, Symmetry
 from vanejax.cad.part import Part, load_part
 from vanejax.errors import InputError
 from vanejax.localization import misfit
@@ -22,6 +23,7 @@ from vanejax.localization.assessment import (
     competing_hypotheses,
 )
 from vanejax.localization.clutter_removal import segmentations, with_clutter, without_clutter
+from vanejax.localization.covariance import moved_to
 from vanejax.localization.edge_rounding import check_window, refine_sharpened
 from vanejax.localization.fine_registration import refine, subset
 from vanejax.localization.form_deviation import check_lengths, with_form_deviation
@@ -59,6 +61,7 @@ def register(
     form_tolerance_mm: float | None = None,
     calibration: Calibration | Sensor | str | None = None,
     sensor: Sensor | str | None = None,
+    symmetry: Symmetry | str = "none",
     seed: int = 0,
 ) -> PoseResult:
     """Finds the pose of a part in a scan, its covariance, and whether to trust it.
@@ -93,11 +96,17 @@ def register(
         name of a preset; for a scan in the camera's frame. It then counts in the covariance.
       sensor: a stereo camera, or a name of `vanejax.scanner.sensor.PRESETS`, whose matching window
         rounds edges off: that is then taken out, see `edge_rounding`.
+      symmetry: poses that are the same by it are one: `Symmetry`, or what its ``parse`` reads, such
+        as "z:180". That one is reported which is nearest to ``init``, or without one the least
+        turned from the camera's axes; where the CAD model is less symmetric, that which fits best.
       seed: of all random subsets: same seed, same result.
 
     Raises:
-      InputError: a file or a value that makes no sense; a part that the weights do not know.
+      InputError: a file or a value that makes no sense; a part that the weights do not know; a
+        symmetry that the CAD model does not have.
     """
+    if isinstance(symmetry, str):
+        symmetry = Symmetry.parse(symmetry)
     check_lengths(max_allowance_mm, form_tolerance_mm)
     if isinstance(sensor, str):
         sensor = preset(sensor)
@@ -119,7 +128,9 @@ def register(
         "form_tolerance_mm": form_tolerance_mm,
         "calibration": calibration,
     }
-    task = _Task(part, init, weights, limits or Limits(), form, sensor, seed, seconds)
+    with _timed(seconds, "symmetry"):
+        of_part = symmetry.on(part)
+    task = _Task(part, init, weights, limits or Limits(), form, sensor, of_part, seed, seconds)
     results = []
     for segments in segmentations(scan, part, segment, seed=seed):
         seen = scan if segments is None else without_clutter(scan, segments)
@@ -144,6 +155,7 @@ class _Task:
     limits: Limits
     form: dict[str, Any]
     sensor: Sensor | None
+    symmetry: PartSymmetry | None
     seed: int
     seconds: dict[str, float]
 
@@ -257,7 +269,7 @@ def _search(
             matched = _match(scan, guesses, task, task.weights.iterations)
             guesses = concatenate(guesses, matched)
         with _timed(task.seconds, "search"):
-            candidates = converge(model, points, guesses, seed=seed)
+            candidates = converge(model, points, guesses, seed=seed, symmetry=task.symmetry)
         yield candidates
         return
     if task.weights is not None:
@@ -267,11 +279,15 @@ def _search(
         guesses = initial_poses(model, sample, icosahedral_rotations())
         matched = _match(scan, guesses, task, MATCH_ITERATIONS)
         with _timed(task.seconds, "search"):
-            candidates = search(model, points, extra=matched, count=0, seed=seed)
+            candidates = search(
+                model, points, extra=matched, count=0, seed=seed, symmetry=task.symmetry
+            )
         yield candidates
     for attempt, count in enumerate(rotations):
         with _timed(task.seconds, "search"):
-            candidates = search(model, points, count=count, seed=seed + attempt)
+            candidates = search(
+                model, points, count=count, seed=seed + attempt, symmetry=task.symmetry
+            )
         yield candidates
 
 
@@ -292,10 +308,17 @@ def _localize(
     """From candidates to a result: compete, choose, refine, verify and judge."""
     points, seed = scan.points, task.seed
     with _timed(task.seconds, "challenge"):
-        hypotheses = competing_hypotheses(model, points, candidates, seed=seed)
-        poses = choose(model, hypotheses, guess=task.init)
+        hypotheses = competing_hypotheses(
+            model, points, candidates, seed=seed, symmetry=task.symmetry
+        )
+        poses = choose(model, hypotheses, task.init, task.symmetry)
     with _timed(task.seconds, "refine"):
         refinement = _refine(model, scan, select(poses, 0), task)
+    before = task.init
+    if before is None:
+        before = candidates.pose(0)
+        if task.symmetry is not None:
+            before = task.symmetry.canonical(before, refinement.part_from_camera)
     with _timed(task.seconds, "verify"):
         assessment = assess(
             model,
@@ -305,6 +328,7 @@ def _localize(
             guess=task.init,
             limits=task.limits,
             seed=seed,
+            symmetry=task.symmetry,
         )
     return PoseResult(
         part_from_camera=refinement.part_from_camera,
@@ -313,10 +337,11 @@ def _localize(
         uncertainty=assessment.uncertainty,
         verification=assessment.verification,
         alternatives=assessment.alternatives,
-        before=candidates.pose(0) if task.init is None else task.init,
+        before=before,
         sensor_origin=scan.sensor_origin,
-        notes=(*scan.notes, *task.part.notes, *_notes(assessment)),
+        notes=(*scan.notes, *task.part.notes, *_notes(assessment, task)),
         seconds=task.seconds,
+        symmetry=task.symmetry,
     )
 
 
@@ -328,11 +353,17 @@ def _refine(
     refinement = refine(model, points, pose, seed=task.seed)
     if task.sensor is not None and isinstance(model, RayCasting):
         refinement, points = refine_sharpened(model, scan, refinement, task.sensor, seed=task.seed)
-    return with_form_deviation(model, points, refinement, seed=task.seed, **task.form)
+    refinement = with_form_deviation(model, points, refinement, seed=task.seed, **task.form)
+    if task.symmetry is None or not task.symmetry.is_exact:
+        return refinement
+    pose = task.symmetry.canonical(refinement.part_from_camera, task.init)
+    return moved_to(refinement, pose, model.part.center)
 
 
-def _notes(assessment: Assessment) -> Iterator[str]:
-    """What only the guess decided."""
+def _notes(assessment: Assessment, task: _Task) -> Iterator[str]:
+    """What was taken for one pose, and what only the guess decided."""
+    if task.symmetry is not None:
+        yield task.symmetry.in_words(task.init is not None)
     turns = [f"{other.rotation_deg:.1f} deg" for other in assessment.ruled_out]
     if len(turns) == 1:
         yield f"a pose turned by {turns[0]} fits as well; the guess rules it out"

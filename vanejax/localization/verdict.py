@@ -106,6 +106,8 @@ def judge(
         most = verification.inlier_share >= limits.least_inlier_share
         return Verdict("rejected", reason + (material if most else ""))
     differences = "".join(f"; {words}" for words in in_words(form)) + material
+    if uncertainty.free_axis is not None:
+        differences += f"; the rotation about {_axis(uncertainty.free_axis)} is free by symmetry"
     for reasons in (
         _doubts(verification, competing, radius_mm, limits),
         _doubts_of_form(form, radius_mm, limits),

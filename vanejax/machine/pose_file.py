@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from vanejax.cad.declared_symmetry import PartSymmetry
 from vanejax.errors import InputError
 from vanejax.files import write_json
 from vanejax.localization.pose_result import PointStatus, PoseResult, Verdict
@@ -39,6 +40,8 @@ CONVENTIONS = {
     "euler_xyz_deg": "angles (a, b, c) about the fixed axes x, then y, then z: "
     "R = Rz(c) Ry(b) Rx(a); degrees",
     "kuka": "X, Y, Z in mm; A, B, C in degrees with R = Rz(A) Ry(B) Rx(C)",
+    "symmetry": "motion @ part_from_camera is the same pose for each of the motions, 4x4, part "
+    "frame, mm; so is every rotation about the free axis, about which sigma is null",
     "shares": "0 to 1",
     "null": "not known",
 }
@@ -165,12 +168,26 @@ def result_to_dict(
                 "information": refinement.information,
             },
             "form_deviation": refinement.form and dataclasses.asdict(refinement.form),
+            "symmetry": _symmetry(result.symmetry),
             "alternatives": alternatives,
             "before_refinement": {"part_from_camera": result.before.as_matrix()},
             "notes": list(result.notes),
             "seconds": dict(result.seconds),
         }
     )
+
+
+def _symmetry(symmetry: PartSymmetry | None) -> dict[str, Any] | None:
+    """What makes poses one, as plain values."""
+    if symmetry is None:
+        return None
+    axis = symmetry.free_axis
+    return {
+        "declared": str(symmetry.declared),
+        "motions": symmetry.motions,
+        "free_axis": axis and {"point_mm": axis[0], "direction": axis[1]},
+        "largest_difference_mm": symmetry.difference_mm,
+    }
 
 
 def write_result(path: str | os.PathLike[str], result: PoseResult, **names: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import importlib.metadata
 import os
@@ -249,10 +250,10 @@ def _against_truth(result: PoseResult, truth: RigidTransform) -> dict[str, Any]:
     """The error, and its chi-square under the covariance: e^T C^-1 e, six degrees of freedom."""
     uncertainty: Uncertainty = result.uncertainty
     error = _difference(truth, result.part_from_camera, uncertainty.center)
-    try:
-        chi_square = float(error @ np.linalg.solve(uncertainty.covariance, error))
-    except np.linalg.LinAlgError:
-        chi_square = float("nan")
+    chi_square = float("nan")
+    if uncertainty.free_axis is None:  # else the error may turn by any angle
+        with contextlib.suppress(np.linalg.LinAlgError):
+            chi_square = float(error @ np.linalg.solve(uncertainty.covariance, error))
     return {
         "rotation_deg": float(np.degrees(np.linalg.norm(error[:3]))),
         "translation_mm": float(np.linalg.norm(error[3:])),
