@@ -170,7 +170,9 @@ def test_everything_reaches_register(files, fake, wedge: Part, tmp_path: Path) -
     # f64 rounding of the nearest rotation
     np.testing.assert_allclose(given["init"].as_matrix(), guess.as_matrix(), rtol=0, atol=1e-14)
     assert (given["seed"], given["weights"]) == (7, None)
-    assert register(files, "--sensor-origin=unknown") == 0
+    assert str(given["symmetry"]) == "none"
+    assert register(files, "--sensor-origin=unknown", "--symmetry", "z:any,x:180") == 0
+    assert str(called[1][2]["symmetry"]) == "z:any,x:180"
     assert called[1][0].sensor_origin is None
     assert called[1][2]["init"] is None
 
@@ -242,6 +244,14 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
         (
             ["register", "scan.ply", "wedge.stl", "--tolerance", "1mm"],
             "a length and an angle above",
+        ),
+        (
+            ["register", "scan.ply", "wedge.stl", "--symmetry", "w:180"],
+            "symmetry w:180: w:180 is no axis and angle",
+        ),
+        (
+            ["register", "scan.ply", "wedge.stl", "--symmetry", "z:100"],
+            "100 deg is no half, third or other whole part of 360 deg",
         ),
         (["register", "scan.ply", "wedge.stl", "--calibration", "ideal"], "'ideal' has no errors"),
         (["register", "scan.ply", "wedge.stl", "--sensor-origin", "here"], "here: should be X,Y,Z"),

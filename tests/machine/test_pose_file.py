@@ -15,8 +15,10 @@ from hypothesis import strategies as st
 from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
+from vanejax.cad.declared_symmetry import PartSymmetry, Symmetry
 from vanejax.errors import InputError
 from vanejax.machine.pose_file import pose_to_dict, read_pose, result_to_dict, write_result
+from vanejax.machine.pose_record import read_record
 from vanejax.rigid import RigidTransform, rigid_from_matrix
 
 NAMES = {"scan_name": "scan", "part_name": "vane", "part_sha256": "ab" * 32}
@@ -108,6 +110,30 @@ def test_what_is_not_known_is_null_not_nan(tmp_path: Path) -> None:
     assert values["scan"]["sensor_origin_mm"] is None
     assert values["uncertainty"]["covariance"][0] == [None] * 6
     assert result_to_dict(result, **NAMES)["refinement"]["converged"] is True
+
+
+def test_the_symmetry_is_written_and_a_free_rotation_is_null(tmp_path: Path) -> None:
+    result = example_result()
+    axis = (np.array([7.0, -4.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    symmetry = PartSymmetry(Symmetry.parse("z:any,x:180"), np.eye(4)[None], axis, 0.02, axis[0], 50)
+    free = dataclasses.replace(
+        result.uncertainty, rotation_sigma_deg=np.array([0.1, 0.2, np.inf]), free_axis=axis[1]
+    )
+    write_result(
+        tmp_path / "pose.json",
+        dataclasses.replace(result, symmetry=symmetry, uncertainty=free),
+        **NAMES,
+    )
+    written = strict((tmp_path / "pose.json").read_text())
+    assert written["symmetry"] == {
+        "declared": "z:any,x:180",
+        "motions": np.eye(4)[None].tolist(),
+        "free_axis": {"point_mm": [7, -4, 0], "direction": [0, 0, 1]},
+        "largest_difference_mm": 0.02,
+    }
+    assert written["uncertainty"]["rotation_sigma_deg"] == [0.1, 0.2, None]
+    assert result_to_dict(result, **NAMES)["symmetry"] is None
+    assert read_record(tmp_path / "pose.json").covariance is not None
 
 
 def test_every_way_to_write_a_guess(tmp_path: Path) -> None:

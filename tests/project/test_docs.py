@@ -384,7 +384,7 @@ def test_the_quick_start_runs_as_written(tmp_path, monkeypatch, capsys) -> None:
         for line, kept in zip(code.splitlines(), masked(code), strict=True):
             if line and not re.match(r"time:|\.\.\.|REJECTED", line):
                 assert kept in here, f"not printed: {line}"
-    assert (run, verdicts) == (9, 6)
+    assert (run, verdicts) == (10, 7)
     assert Path("pose.html").stat().st_size > 10_000
     assert json.loads(Path("pose.json").read_text())["verdict"]["status"] == "accepted"
 

@@ -147,7 +147,9 @@ class PartSymmetry:
             direction = ", ".join(f"{v:.2f}" for v in self.free_axis[1])
             free = f"the rotation about ({direction}) is free"
             one = f"{one}, and {free}" if one else free
-        differs = f"the CAD model differs from itself by at most {self.difference_mm:.2g} mm"
+        differs = (
+            f"the CAD model differs from itself by at most {max(self.difference_mm, 1e-3):.2g} mm"
+        )
         if not self.is_exact:
             return (
                 f"{name}{one} by your word, though {differs} after such a turn; the pose that fits "

@@ -128,8 +128,10 @@ def register(
         "form_tolerance_mm": form_tolerance_mm,
         "calibration": calibration,
     }
-    with _timed(seconds, "symmetry"):
-        of_part = symmetry.on(part)
+    of_part = None
+    if symmetry != Symmetry():
+        with _timed(seconds, "symmetry"):
+            of_part = symmetry.on(part)
     task = _Task(part, init, weights, limits or Limits(), form, sensor, of_part, seed, seconds)
     results = []
     for segments in segmentations(scan, part, segment, seed=seed):
