@@ -47,6 +47,16 @@ def test_all_well_is_accepted_and_says_why():
     assert verdict(competing=()).status == "accepted"
 
 
+def test_a_free_rotation_is_named_in_the_verdict():
+    free = {"free_axis": np.array([0.0, 0.0, 1.0])}
+    found = verdict(uncertainty=free)
+    assert found.status == "accepted"
+    assert found.reason.endswith("; the rotation about the part's z is free by symmetry")
+    doubt = verdict(inlier_share=0.65, uncertainty=free)
+    assert doubt.status == "ambiguous"
+    assert doubt.reason.endswith("is free by symmetry")
+
+
 REJECTED = {
     "only 30 points": {"checked": np.arange(32)},
     "only 40% of the points lie on the part (within 0.3 mm)": {"inlier_share": 0.4},

@@ -241,7 +241,7 @@ def _declared(symmetry: Symmetry, part: Part) -> PartSymmetry:
         if order is not None and (axis is None or not np.array_equal(AXES[name], axis))
     ]
     motions = _group(np.concatenate(turns) if turns else np.empty((0, 4, 4)))
-    if motions is None or (axis is not None and not _keep(motions, axis)):
+    if motions is None or (axis is not None and not _keeps(motions, axis)):
         raise InputError(
             f"symmetry {symmetry}: such turns together make more than {MOST_MOTIONS} poses one; no "
             "part but a ball is like that"
@@ -270,15 +270,14 @@ def _found(part: Part) -> PartSymmetry:
     free_axis = (middle, free[0]) if free else None
     group = np.eye(4)[None]
     found = near_symmetries(part, group, continuous_axis=free_axis)
-    found = sorted(
-        (_snapped(motion, middle, directions) for motion in found), key=lambda s: not s[1]
-    )
-    for motion, _ in found:
+    snapped = [_snapped(motion, middle, directions) for motion in found]
+    # those about round axes first: they make others, of which the axis is known less well
+    for motion, _ in sorted(snapped, key=lambda pair: not pair[1]):
         if _is_known(motion, group):
             continue
         difference = comparison.largest_mm(motion[None])
         larger = _group(np.concatenate([group, motion[None]]))
-        if difference <= limit and larger is not None and (not free or _keep(larger, free[0])):
+        if difference <= limit and larger is not None and (not free or _keeps(larger, free[0])):
             group, largest = larger, max(largest, difference)
     automatic = Symmetry(automatic=True)
     return PartSymmetry(automatic, group, free_axis, largest, part.center, part.radius)
@@ -337,7 +336,7 @@ def _group(generators: np.ndarray) -> np.ndarray | None:
     return group
 
 
-def _keep(group: np.ndarray, axis: np.ndarray) -> bool:
+def _keeps(group: np.ndarray, axis: np.ndarray) -> bool:
     """Whether every motion of a group [S, 4, 4] maps an axis [3] to itself."""
     along = np.abs(group[:, :3, :3] @ axis @ axis)
     return bool((along > math.cos(math.radians(SNAPPED_DEG))).all())
