@@ -137,7 +137,7 @@ class PartSymmetry:
         nearest = self.nearest(batch, guess)
         return RigidTransform(nearest.rotation[0], nearest.translation[0])
 
-    def in_words(self, guess: bool) -> str:
+    def in_words(self, *, guess: bool) -> str:
         """What is assumed, with the figure of the check, and which of the poses is reported."""
         name = f"symmetry {self.declared}: "
         if len(self.motions) == 1 and self.free_axis is None:

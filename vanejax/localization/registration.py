@@ -365,7 +365,7 @@ def _refine(
 def _notes(assessment: Assessment, task: _Task) -> Iterator[str]:
     """What was taken for one pose, and what only the guess decided."""
     if task.symmetry is not None:
-        yield task.symmetry.in_words(task.init is not None)
+        yield task.symmetry.in_words(guess=task.init is not None)
     turns = [f"{other.rotation_deg:.1f} deg" for other in assessment.ruled_out]
     if len(turns) == 1:
         yield f"a pose turned by {turns[0]} fits as well; the guess rules it out"
