@@ -362,9 +362,10 @@ def test_the_quick_start_runs_as_written(tmp_path, monkeypatch, capsys) -> None:
     page = (ROOT / "docs" / "quick_start.md").read_text()
     run, verdicts = 0, 0
     printed = ""
+    space: dict[str, object] = {}  # a later block goes on from an earlier one
     for language, code in blocks(page, "python", "sh", "text"):
         if language == "python":
-            exec(compile(code, "quick_start.md", "exec"), {})
+            exec(compile(code, "quick_start.md", "exec"), space)
             continue
         if language == "sh":
             printed = ""
