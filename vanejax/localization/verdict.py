@@ -65,7 +65,7 @@ class Limits:
     tolerance_mm: float = 1.0
     most_scale_error: float = 0.035
     most_field_mm: float = 0.25
-    most_rough_mm: float = 0.04
+    most_rough_mm: float = 0.03
     most_beyond_edges_share: float = 0.001
     most_unexplained_share: float = 0.05
 
