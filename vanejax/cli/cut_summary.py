@@ -95,7 +95,7 @@ def place_lines(found: Sequence[Place], record: PoseRecord, *, camera_is_exact: 
 
     ``camera_is_exact``: a place of the camera was given without its standard deviations.
     """
-    lines = ["", "uncertainty, in the least certain direction"]
+    lines = ["", "uncertainty"]
     lines += [f"  {place}" for place in found]
     last = found[-1]
     if last.by_camera_mm is not None:

@@ -14,8 +14,8 @@ from PIL import Image, ImageChops
 from experiments import docs
 from vanejax.plotting.canvas import WIDTH_IN
 
-# drawn by long runs or from scans that are not here
-FROM_RUNS = {"overview.png", "real_scans.png", "sensor_effects.png"}
+# drawn by long runs, by the program of a page, or from scans that are not here
+FROM_RUNS = {"overview.png", "placement.png", "real_scans.png", "sensor_effects.png"}
 OF_RECORDS = docs.record_pictures()
 ALIKE = 0.15  # another machine's letters differ by 0.02, another picture by more than 0.5
 
