@@ -135,4 +135,8 @@ JSON = st.recursive(
 )
 def test_nothing_but_an_input_error_comes_of_rubbish(tmp_path: Path, values: Any) -> None:
     with contextlib.suppress(InputError):
-        read(tmp_path, {"part_from_camera": np.eye(4).tolist()} | values)
+        record = read(tmp_path, {"part_from_camera": np.eye(4).tolist()} | values)
+        numbers = [] if record.covariance is None else [record.covariance.covariance]
+        if record.form is not None:
+            numbers += [v for v in vars(record.form).values() if isinstance(v, int | float)]
+        assert all(np.isfinite(each).all() for each in numbers)
