@@ -50,12 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of x,y,z,rx,ry,rz, those along and about which the part may not be moved: the part's "
         "axes as registered, through its centre",
     )
-    parser.add_argument(
-        "--units-scan",
-        metavar="UNIT",
-        default="auto",
-        help="unit of the numbers in SCAN: auto (default), mm, cm, m, in, ft or um",
-    )
+    workpiece.add_scan_units(parser)
     parser.add_argument(
         "--sensor-origin",
         metavar="X,Y,Z",

@@ -30,12 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a matcher trained for this part, from `vanejax export`, or pretrained: the one that "
         "comes with the package, for the built-in vane; works without",
     )
-    parser.add_argument(
-        "--units-scan",
-        metavar="UNIT",
-        default="auto",
-        help="unit of the numbers in SCAN: auto (default), mm, cm, m, in, ft or um",
-    )
+    workpiece.add_scan_units(parser)
     parser.add_argument(
         "--init",
         metavar="FILE",

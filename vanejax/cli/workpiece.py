@@ -32,6 +32,16 @@ def add_units(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_scan_units(parser: argparse.ArgumentParser) -> None:
+    """Adds ``--units-scan``, for a command that takes a SCAN."""
+    parser.add_argument(
+        "--units-scan",
+        metavar="UNIT",
+        default="auto",
+        help="unit of the numbers in SCAN: auto (default), mm, cm, m, in, ft or um",
+    )
+
+
 def load_workpiece(arguments: argparse.Namespace, *, must_be_closed: bool = True) -> Part:
     """The part that CAD and ``--units-cad`` name.
 

@@ -85,9 +85,7 @@ class Field(NamedTuple):
         ``B = d(displacement) / d(motion)`` and ``G = sum B^T B``: that is the pose's, by what the
         pose of a part that is bent means.
         """
-        moves = np.concatenate(
-            [-_cross_matrices(surface), np.tile(np.eye(3), (len(surface), 1, 1))], -1
-        )
+        moves = ways_of_motion(surface)
         fit = np.linalg.solve(
             np.einsum("sij,sik->jk", moves, moves), moves.swapaxes(-1, -2)
         )  # [S, 6, 3]
@@ -110,9 +108,10 @@ def _similarity(first: np.ndarray, second: np.ndarray, length_mm: float) -> np.n
     return np.exp(-0.5 * squared / length_mm**2)
 
 
-def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
-    """[S, 3, 3] C with ``C w = v x w`` for vectors v [S, 3]."""
-    return np.cross(vectors[:, None, :], np.eye(3)[None]).swapaxes(-1, -2)
+def ways_of_motion(points: np.ndarray) -> np.ndarray:
+    """[n, 3, 6] W: a small motion m = (rotation vector, shift) moves points [n, 3] by ``W m``."""
+    turns = np.cross(np.eye(3)[None], points[:, None, :]).swapaxes(-1, -2)
+    return np.concatenate([turns, np.broadcast_to(np.eye(3), turns.shape)], axis=-1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -235,10 +234,8 @@ def average_models(patches: Patches, current: np.ndarray, prior: Prior) -> Avera
     others = _on_most_faces(patches, current, prior) if doubtful else kept
     if not others.all():
         other = _average(patches.select(others), current, prior)
-        if (
-            other[2] + np.count_nonzero(~others) * np.log(OUTLIER_SHARE / OUTLIER_RANGE_MM)
-            > evidence
-        ):
+        by_outliers = np.log(OUTLIER_SHARE / OUTLIER_RANGE_MM) * np.count_nonzero(~others)
+        if other[2] + by_outliers > evidence:
             kept, (average, standard, _) = others, other
     for _ in range(2):
         far = np.flatnonzero(kept)[np.abs(standard) > OUTLIER]

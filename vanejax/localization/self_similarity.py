@@ -18,6 +18,7 @@ from vanejax.cad.part import Part
 from vanejax.cad.surface import Surface
 from vanejax.localization.fine_registration import robust_gauss_newton
 from vanejax.localization.pose_batch import concatenate, distances, distinct, select
+from vanejax.localization.random_fields import ways_of_motion
 from vanejax.localization.residuals import SurfaceMatching
 from vanejax.rigid import RigidTransform
 
@@ -148,7 +149,7 @@ def _slippable_screws(points: np.ndarray, normals: np.ndarray) -> list[np.ndarra
     normals against the squared way, from each of the six of all points.
     """
     columns = np.concatenate([np.cross(points, normals), normals], axis=1)
-    ways = np.concatenate([-_cross(points), np.tile(np.eye(3), (len(points), 1, 1))], axis=-1)
+    ways = ways_of_motion(points)
     way = np.einsum("nij,nik->jk", ways, ways) / len(points)
     screws = []
     for start in eigh(columns.T @ columns, way)[1].T:
@@ -169,8 +170,3 @@ def _slip(points: np.ndarray, normals: np.ndarray, screw: np.ndarray) -> np.ndar
     way = np.cross(screw[:3], points) + screw[3:]
     along = np.abs(np.sum(way * normals, axis=1))
     return along / np.maximum(np.linalg.norm(way, axis=1), 0.1)
-
-
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    """[n, 3, 3] C with ``C w = v x w`` for vectors v [n, 3]."""
-    return np.cross(vectors[:, None, :], np.eye(3)[None]).swapaxes(-1, -2)
